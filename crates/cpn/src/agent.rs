@@ -1,0 +1,159 @@
+//! The compared methods behind one interface (section "Methods for comparison").
+
+use crate::config::ModelConfig;
+use crate::dynamics::PolicyDynamics;
+use crate::encoder::Encoder;
+use crate::loss;
+use crate::planner::{InnerLoop, Plan};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::sync::{Mutex, PoisonError};
+use tch::{Device, Kind, Tensor, nn};
+
+/// Anything that turns an observation and a goal into actions. Model predictive control applies the first action of each
+/// plan and plans anew.
+pub trait Method: Send {
+    /// Short name of the method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    fn name(&self) -> &'static str;
+
+    /// Number of actions in a plan.
+    fn horizon(&self) -> i64;
+
+    /// Embeds images `[B, 84, 84, 3]` as `[B, Z]`; Z is 0 for a method that does not look.
+    fn encode(&self, images: &Tensor) -> Tensor;
+
+    /// Plans from x to x_g, both `[B, Z]`. `seed` drives whatever is random.
+    fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Plan;
+}
+
+/// A learned method: encoder, g_θ and the step size of its inner loop.
+#[derive(Debug)]
+pub struct Agent {
+    config: ModelConfig,
+    variables: nn::VarStore,
+    encoder: Encoder,
+    network: PolicyDynamics,
+    step_size: Tensor,
+}
+
+impl Agent {
+    /// A freshly initialised agent, the same for the same seed. The configuration must be valid.
+    pub fn new(config: ModelConfig, seed: u64) -> Self {
+        // libtorch's generator is one for the whole process.
+        static GENERATOR: Mutex<()> = Mutex::new(());
+        let _generator = GENERATOR.lock().unwrap_or_else(PoisonError::into_inner);
+        tch::manual_seed(seed.cast_signed());
+        let variables = nn::VarStore::new(Device::Cpu);
+        let root = variables.root();
+        Self {
+            encoder: Encoder::new(&(&root / "encoder"), &config.encoder),
+            network: PolicyDynamics::new(&(&root / "network"), &config),
+            step_size: root.ones("step_size", &[]),
+            config,
+            variables,
+        }
+    }
+
+    /// What the agent is made of.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// The named weights; the trainer updates them in place.
+    pub fn variables(&self) -> &nn::VarStore {
+        &self.variables
+    }
+
+    /// The named weights, for freezing or changing their kind.
+    pub fn variables_mut(&mut self) -> &mut nn::VarStore {
+        &mut self.variables
+    }
+
+    /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates.
+    ///
+    /// `observations` and `goals` are `[B, 84, 84, 3]`, `actions` the demonstrated `[B, H, A]`, `mask` `[B, H]` tells
+    /// which of them the demonstration has.
+    pub fn outer_loss(&self, observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Tensor {
+        let needs_goal = self.config.method.is_goal_conditioned() || self.config.method.plans();
+        let (x, x_g) = if needs_goal {
+            let embeddings = self.encoder.encode(&Tensor::cat(&[observations, goals], 0));
+            let mut halves = embeddings.chunk(2, 0).into_iter();
+            (halves.next().expect("first half"), halves.next().expect("second half"))
+        } else {
+            let x = self.encoder.encode(observations);
+            let x_g = x.zeros_like();
+            (x, x_g)
+        };
+        let planned = if self.config.method.plans() {
+            self.inner_loop().plan_differentiably(&x, &x_g).actions
+        } else {
+            self.react(&x, &x_g)
+        };
+        loss::behaviour_cloning(&planned, actions, mask)
+    }
+
+    /// The inner loop of a planning method.
+    pub fn inner_loop(&self) -> InnerLoop<'_> {
+        InnerLoop {
+            network: &self.network,
+            step_size: &self.step_size,
+            horizon: self.config.horizon,
+            updates: self.config.updates,
+        }
+    }
+
+    /// The policy's action for x and x_g `[B, Z]`, as a plan of one step `[B, 1, A]`.
+    fn react(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
+        self.network.policy(&self.network.features(x, x_g)).unsqueeze(1)
+    }
+}
+
+impl Method for Agent {
+    fn name(&self) -> &'static str {
+        self.config.method.name()
+    }
+
+    fn horizon(&self) -> i64 {
+        self.config.horizon
+    }
+
+    fn encode(&self, images: &Tensor) -> Tensor {
+        tch::no_grad(|| self.encoder.encode(images))
+    }
+
+    fn plan(&self, x: &Tensor, x_g: &Tensor, _seed: u64) -> Plan {
+        if self.config.method.plans() {
+            self.inner_loop().plan(x, x_g)
+        } else {
+            Plan { actions: tch::no_grad(|| self.react(x, x_g)), inner_losses: Vec::new() }
+        }
+    }
+}
+
+/// The control of every comparison: uniform actions in [-1, 1], whatever the images show.
+#[derive(Debug)]
+pub struct Random {
+    /// A, the number of continuous actions.
+    pub actions: i64,
+}
+
+impl Method for Random {
+    fn name(&self) -> &'static str {
+        "random"
+    }
+
+    fn horizon(&self) -> i64 {
+        1
+    }
+
+    fn encode(&self, images: &Tensor) -> Tensor {
+        Tensor::zeros([images.size()[0], 0], (Kind::Float, Device::Cpu))
+    }
+
+    fn plan(&self, x: &Tensor, _x_g: &Tensor, seed: u64) -> Plan {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let shape = [x.size()[0], 1, self.actions];
+        let values: Vec<f32> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..=1.0)).collect();
+        Plan { actions: Tensor::from_slice(&values).view(shape), inner_losses: Vec::new() }
+    }
+}

@@ -1,0 +1,157 @@
+//! Checkpoints: weights, with everything needed to rebuild and to trace the model in the file's metadata.
+
+use crate::agent::Agent;
+use crate::archive::{self, ArchiveError, Tensors};
+use crate::config::{ConfigError, ModelConfig};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use tch::Kind;
+
+/// Largest checkpoint that is read, in bytes.
+pub const MAX_BYTES: usize = 64 << 20;
+/// Version of the metadata; another one is refused.
+const FORMAT: u32 = 1;
+
+/// Where a model comes from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Provenance {
+    /// Tasks whose demonstrations it was trained on.
+    pub training_tasks: Vec<String>,
+    /// SHA-256 over the digests of the training episodes, in hex.
+    pub data_digest: String,
+    /// Seed of initialisation and sampling.
+    pub seed: u64,
+    /// Passes over every frame.
+    pub epochs: u32,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Metadata {
+    format: u32,
+    model: ModelConfig,
+    provenance: Provenance,
+}
+
+/// A loaded model.
+#[derive(Debug)]
+pub struct Checkpoint {
+    /// The agent, its weights frozen.
+    pub agent: Agent,
+    /// Where it comes from.
+    pub provenance: Provenance,
+    /// SHA-256 of the checkpoint's bytes, in hex.
+    pub digest: String,
+}
+
+/// Serialises an agent; the same weights give the same bytes.
+///
+/// # Errors
+/// If the weights cannot be represented.
+pub fn to_bytes(agent: &Agent, provenance: &Provenance) -> Result<Vec<u8>, ArchiveError> {
+    let metadata = Metadata { format: FORMAT, model: agent.config().clone(), provenance: provenance.clone() };
+    archive::to_bytes(&agent.variables().variables().into_iter().collect(), &metadata)
+}
+
+/// Rebuilds a model from a stranger's bytes.
+///
+/// # Errors
+/// Says what is wrong with the file: size, format, configuration, or a tensor that is missing, unknown, of the wrong
+/// shape or kind, or not finite.
+pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
+    if bytes.len() > MAX_BYTES {
+        return Err(CheckpointError::TooLarge { got: bytes.len() });
+    }
+    let (tensors, metadata): (_, Metadata) = archive::from_bytes(bytes)?;
+    if metadata.format != FORMAT {
+        return Err(CheckpointError::Format { got: metadata.format });
+    }
+    metadata.model.validate()?;
+    let mut agent = Agent::new(metadata.model, 0);
+    copy_weights(&tensors, &agent)?;
+    agent.variables_mut().freeze();
+    Ok(Checkpoint { agent, provenance: metadata.provenance, digest: digest(bytes) })
+}
+
+/// SHA-256 of bytes, in hex: how checkpoints are named.
+pub fn digest(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}
+
+/// Copies `tensors` over the agent's weights.
+///
+/// # Errors
+/// If they are not exactly the agent's weights in name, shape and kind, or not finite.
+pub fn copy_weights(tensors: &Tensors, agent: &Agent) -> Result<(), CheckpointError> {
+    let mut variables = agent.variables().variables();
+    if let Some(name) = tensors.keys().find(|name| !variables.contains_key(*name)) {
+        return Err(CheckpointError::UnknownTensor { name: name.clone() });
+    }
+    for (name, variable) in &mut variables {
+        let tensor = tensors.get(name).ok_or_else(|| CheckpointError::MissingTensor { name: name.clone() })?;
+        if tensor.kind() != Kind::Float || tensor.size() != variable.size() {
+            return Err(CheckpointError::Shape {
+                name: name.clone(),
+                expected: format!("Float{:?}", variable.size()),
+                got: format!("{:?}{:?}", tensor.kind(), tensor.size()),
+            });
+        }
+        if tensor.isfinite().all().int64_value(&[]) == 0 {
+            return Err(CheckpointError::NotFinite { name: name.clone() });
+        }
+        tch::no_grad(|| variable.copy_(tensor));
+    }
+    Ok(())
+}
+
+/// Why a checkpoint was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// More bytes than are ever read.
+    #[error("checkpoint: expected at most {MAX_BYTES} bytes, got {got}")]
+    TooLarge {
+        /// Size that came, in bytes.
+        got: usize,
+    },
+    /// Not a well-formed archive.
+    #[error("checkpoint: {0}")]
+    Unreadable(#[from] ArchiveError),
+    /// Written by another version of this crate.
+    #[error("checkpoint format: expected {FORMAT}, got {got}")]
+    Format {
+        /// Format that came.
+        got: u32,
+    },
+    /// A configuration out of range.
+    #[error("checkpoint model: {0}")]
+    Config(#[from] ConfigError),
+    /// A weight that the configuration asks for is not in the file.
+    #[error("checkpoint tensor \"{name}\": expected by the model's configuration, got none")]
+    MissingTensor {
+        /// The weight's name.
+        name: String,
+    },
+    /// The file holds a tensor that the configuration does not know.
+    #[error("checkpoint tensor \"{name}\": not part of the model's configuration")]
+    UnknownTensor {
+        /// The tensor's name.
+        name: String,
+    },
+    /// A weight of another shape or kind.
+    #[error("checkpoint tensor \"{name}\": expected {expected}, got {got}")]
+    Shape {
+        /// The weight's name.
+        name: String,
+        /// Kind and shape by the configuration.
+        expected: String,
+        /// Kind and shape in the file.
+        got: String,
+    },
+    /// A weight that is NaN or infinite.
+    #[error("checkpoint tensor \"{name}\": expected finite values, got NaN or infinity")]
+    NotFinite {
+        /// The weight's name.
+        name: String,
+    },
+}

@@ -1,0 +1,187 @@
+//! What a model is made of: sizes, method, presets.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// A learned method of the paper's comparison (section "Methods for comparison").
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MethodKind {
+    /// Behaviour cloning from the observation alone.
+    Bc,
+    /// Behaviour cloning conditioned on the goal's embedding.
+    TeBc,
+    /// Universal planning network: plans, without goal conditioning or neuromodulation.
+    Upn,
+    /// Contextual planning network: plans, conditioned on the goal's embedding, with neuromodulated layers.
+    Cpn,
+}
+
+impl MethodKind {
+    /// Every learned method, in the paper's order.
+    pub const ALL: [Self; 4] = [Self::Bc, Self::TeBc, Self::Upn, Self::Cpn];
+
+    /// Whether g_θ sees the goal's embedding.
+    pub fn is_goal_conditioned(self) -> bool {
+        matches!(self, Self::TeBc | Self::Cpn)
+    }
+
+    /// Whether actions come from the inner loop.
+    pub fn plans(self) -> bool {
+        matches!(self, Self::Upn | Self::Cpn)
+    }
+
+    /// Whether the fully connected layers of g_θ are neuromodulated.
+    pub fn is_neuromodulated(self) -> bool {
+        self == Self::Cpn
+    }
+
+    /// The name used in configuration, on the wire and in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Bc => "bc",
+            Self::TeBc => "te-bc",
+            Self::Upn => "upn",
+            Self::Cpn => "cpn",
+        }
+    }
+}
+
+impl fmt::Display for MethodKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// One convolution, without padding, followed by a rectified linear unit.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConvConfig {
+    /// Output channels.
+    pub channels: i64,
+    /// Kernel width and height in pixels.
+    pub kernel: i64,
+    /// Stride in pixels.
+    pub stride: i64,
+}
+
+impl ConvConfig {
+    const fn new(channels: i64, kernel: i64, stride: i64) -> Self {
+        Self { channels, kernel, stride }
+    }
+}
+
+/// The image encoder f_φ.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncoderConfig {
+    /// Convolutions from the image on.
+    pub convolutions: Vec<ConvConfig>,
+    /// Z, the size of the embedding.
+    pub latent: i64,
+    /// Whether the embedding is layer-normalised, which keeps the inner loss on one scale.
+    pub layer_norm: bool,
+}
+
+impl EncoderConfig {
+    /// Our reading of the paper's encoder, whose widths stand only in a figure: the three convolutions customary for
+    /// 84×84 images, and a latent of 64.
+    pub fn paper() -> Self {
+        Self {
+            convolutions: vec![ConvConfig::new(32, 8, 4), ConvConfig::new(64, 4, 2), ConvConfig::new(64, 3, 1)],
+            latent: 64,
+            layer_norm: true,
+        }
+    }
+
+    /// The encoder of the released code of Universal Planning Networks (Srinivas et al., 2018).
+    pub fn upn() -> Self {
+        Self {
+            convolutions: vec![
+                ConvConfig::new(32, 8, 4),
+                ConvConfig::new(64, 4, 2),
+                ConvConfig::new(64, 3, 1),
+                ConvConfig::new(16, 2, 1),
+            ],
+            latent: 128,
+            layer_norm: false,
+        }
+    }
+
+    /// Width and height in pixels after the last convolution; `None` if the image is used up before.
+    pub fn output_size(&self) -> Option<i64> {
+        self.convolutions.iter().try_fold(crate::images::SIZE, |size, conv| {
+            (size >= conv.kernel).then(|| (size - conv.kernel) / conv.stride + 1)
+        })
+    }
+}
+
+/// Everything that decides the shape and the planning of a model; stored whole in its checkpoint.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Which of the compared methods this is.
+    pub method: MethodKind,
+    /// The encoder f_φ.
+    pub encoder: EncoderConfig,
+    /// Width of the internal linear layers of g_θ.
+    pub hidden: i64,
+    /// Width of the hidden layer of the attenuation networks u_β and v_γ.
+    pub gate_hidden: i64,
+    /// A, the number of continuous actions.
+    pub actions: i64,
+    /// H, the number of planned steps; 1 for methods that do not plan.
+    pub horizon: i64,
+    /// U, the number of gradient updates of a plan; 0 for methods that do not plan.
+    pub updates: i64,
+}
+
+impl ModelConfig {
+    /// The paper's values: layers 32 wide, 4 actions, H = 5, U = 1.
+    pub fn paper(method: MethodKind) -> Self {
+        let (horizon, updates) = if method.plans() { (5, 1) } else { (1, 0) };
+        Self { method, encoder: EncoderConfig::paper(), hidden: 32, gate_hidden: 32, actions: 4, horizon, updates }
+    }
+
+    /// Checks every value against its range, so that a model can be built from a stranger's file.
+    ///
+    /// # Errors
+    /// Names the first field out of its range, what was expected and what came.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let in_range = |field, value: i64, min, max| {
+            if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { field, value, min, max }) }
+        };
+        in_range("encoder.convolutions", self.encoder.convolutions.len() as i64, 1, 8)?;
+        for conv in &self.encoder.convolutions {
+            in_range("encoder.convolutions.channels", conv.channels, 1, 512)?;
+            in_range("encoder.convolutions.kernel", conv.kernel, 1, 16)?;
+            in_range("encoder.convolutions.stride", conv.stride, 1, 16)?;
+        }
+        in_range("encoder output size in pixels", self.encoder.output_size().unwrap_or(0), 1, 32)?;
+        in_range("encoder.latent", self.encoder.latent, 1, 1024)?;
+        in_range("hidden", self.hidden, 1, 1024)?;
+        in_range("gate_hidden", self.gate_hidden, 1, 256)?;
+        in_range("actions", self.actions, 1, 32)?;
+        if self.method.plans() {
+            in_range("horizon", self.horizon, 1, 64)?;
+            in_range("updates", self.updates, 0, 64)
+        } else {
+            in_range("horizon", self.horizon, 1, 1)?;
+            in_range("updates", self.updates, 0, 0)
+        }
+    }
+}
+
+/// A configuration value out of its range.
+#[derive(Debug, thiserror::Error)]
+#[error("{field}: expected {min} to {max}, got {value}")]
+pub struct ConfigError {
+    /// The field at fault.
+    pub field: &'static str,
+    /// What came.
+    pub value: i64,
+    /// Smallest allowed value.
+    pub min: i64,
+    /// Largest allowed value.
+    pub max: i64,
+}

@@ -1,0 +1,80 @@
+//! g_θ, the combined policy and dynamics network (figure "encoder", b).
+
+use crate::config::ModelConfig;
+use crate::neuromodulated::Neuromodulated;
+use tch::nn::{self, Module};
+use tch::Tensor;
+
+/// A shared trunk, a policy branch and a dynamics branch that also sees the action.
+#[derive(Debug)]
+pub struct PolicyDynamics {
+    trunk: Dense,
+    policy: [Dense; 2],
+    dynamics: Option<[Dense; 2]>,
+    goal_conditioned: bool,
+}
+
+impl PolicyDynamics {
+    /// Builds g_θ under `path`: without the dynamics branch for methods that do not plan, with neuromodulated layers and
+    /// goal conditioning where the method has them.
+    pub fn new(path: &nn::Path, config: &ModelConfig) -> Self {
+        let ModelConfig { method, hidden, actions, .. } = *config;
+        let latent = config.encoder.latent;
+        let dense = |name: &str, inputs, outputs| Dense::new(&(path / name), inputs, outputs, config);
+        let context = if method.is_goal_conditioned() { latent } else { 0 };
+        Self {
+            trunk: dense("trunk", latent + context, hidden),
+            policy: [dense("policy_0", hidden, hidden), dense("policy_1", hidden, actions)],
+            dynamics: method
+                .plans()
+                .then(|| [dense("dynamics_0", hidden + actions, hidden), dense("dynamics_1", hidden, latent)]),
+            goal_conditioned: method.is_goal_conditioned(),
+        }
+    }
+
+    /// The trunk's features of a state: x `[B, Z]` and the goal x_g `[B, Z]` to `[B, hidden]`.
+    pub fn features(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
+        let input = if self.goal_conditioned { Tensor::cat(&[x, x_g], 1) } else { x.shallow_clone() };
+        self.trunk.forward(&input).relu()
+    }
+
+    /// The policy branch: features `[B, hidden]` to an action `[B, A]` in (-1, 1).
+    pub fn policy(&self, features: &Tensor) -> Tensor {
+        self.policy[1].forward(&self.policy[0].forward(features).relu()).tanh()
+    }
+
+    /// The dynamics branch: the state `[B, Z]` after an action `[B, A]`, predicted as a change of x.
+    ///
+    /// # Panics
+    /// If the method does not plan.
+    pub fn next(&self, x: &Tensor, features: &Tensor, action: &Tensor) -> Tensor {
+        let [first, second] = self.dynamics.as_ref().expect("only planning methods roll out");
+        x + second.forward(&first.forward(&Tensor::cat(&[features, action], 1)).relu())
+    }
+}
+
+/// A fully connected layer, neuromodulated or not.
+#[derive(Debug)]
+enum Dense {
+    Linear(nn::Linear),
+    Neuromodulated(Neuromodulated),
+}
+
+impl Dense {
+    fn new(path: &nn::Path, inputs: i64, outputs: i64, config: &ModelConfig) -> Self {
+        if config.method.is_neuromodulated() {
+            Self::Neuromodulated(Neuromodulated::new(path, inputs, outputs, config.gate_hidden))
+        } else {
+            Self::Linear(nn::linear(path, inputs, outputs, Default::default()))
+        }
+    }
+}
+
+impl Module for Dense {
+    fn forward(&self, x: &Tensor) -> Tensor {
+        match self {
+            Self::Linear(layer) => layer.forward(x),
+            Self::Neuromodulated(layer) => layer.forward(x),
+        }
+    }
+}

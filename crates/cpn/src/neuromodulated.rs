@@ -1,0 +1,60 @@
+//! The neuromodulated fully connected layer (section "Neuromodulated meta-learning").
+
+use tch::nn::{self, Init, Module};
+use tch::Tensor;
+
+/// Attenuation starts near 1 (sigmoid(2) = 0.88), so that training starts from an almost plain linear layer.
+const GATE_BIAS: f64 = 2.0;
+
+/// `y = (u_β(x) ⊙ a) x + (v_γ(x) ⊙ b)`: each weight and bias is attenuated by a factor in [0, 1] that depends on the
+/// input.
+#[derive(Debug)]
+pub struct Neuromodulated {
+    linear: nn::Linear,
+    u: Gate,
+    v: Gate,
+}
+
+impl Neuromodulated {
+    /// A layer from `inputs` to `outputs` whose attenuation networks have `gate_hidden` hidden units.
+    pub fn new(path: &nn::Path, inputs: i64, outputs: i64, gate_hidden: i64) -> Self {
+        Self {
+            linear: nn::linear(path, inputs, outputs, Default::default()),
+            u: Gate::new(&(path / "u"), inputs, gate_hidden, outputs * inputs),
+            v: Gate::new(&(path / "v"), inputs, gate_hidden, outputs),
+        }
+    }
+}
+
+impl Module for Neuromodulated {
+    /// `[B, inputs]` to `[B, outputs]`.
+    fn forward(&self, x: &Tensor) -> Tensor {
+        let (outputs, inputs) = self.linear.ws.size2().expect("a linear layer's weight is a matrix");
+        let weight = self.u.forward(x).view([-1, outputs, inputs]) * &self.linear.ws;
+        let bias = self.linear.bs.as_ref().expect("built with a bias");
+        weight.matmul(&x.unsqueeze(-1)).squeeze_dim(-1) + self.v.forward(x) * bias
+    }
+}
+
+/// u_β or v_γ: two linear layers, rectified linear between, sigmoid at the end.
+#[derive(Debug)]
+struct Gate {
+    hidden: nn::Linear,
+    output: nn::Linear,
+}
+
+impl Gate {
+    fn new(path: &nn::Path, inputs: i64, hidden: i64, outputs: i64) -> Self {
+        let open = nn::LinearConfig { bs_init: Some(Init::Const(GATE_BIAS)), ..Default::default() };
+        Self {
+            hidden: nn::linear(path / "hidden", inputs, hidden, Default::default()),
+            output: nn::linear(path / "output", hidden, outputs, open),
+        }
+    }
+}
+
+impl Module for Gate {
+    fn forward(&self, x: &Tensor) -> Tensor {
+        self.output.forward(&self.hidden.forward(x).relu()).sigmoid()
+    }
+}

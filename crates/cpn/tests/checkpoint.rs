@@ -1,0 +1,104 @@
+//! Checkpoints come back as they were, and damaged ones are refused with the reason.
+
+mod common;
+
+use common::{noise_images, small_config};
+use cpn::archive::{self, Tensors};
+use cpn::checkpoint::{self, Provenance};
+use cpn::{Agent, Method, MethodKind};
+use serde_json::{Value, json};
+
+fn provenance() -> Provenance {
+    Provenance { training_tasks: vec!["door-lock".into()], data_digest: "d".into(), seed: 5, epochs: 2 }
+}
+
+fn saved() -> Vec<u8> {
+    checkpoint::to_bytes(&Agent::new(small_config(MethodKind::Cpn), 5), &provenance()).unwrap()
+}
+
+/// The message of the refusal of a checkpoint that `spoil` has made wrong.
+fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
+    let (mut tensors, mut metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
+    spoil(&mut tensors, &mut metadata);
+    checkpoint::from_bytes(&archive::to_bytes(&tensors, &metadata).unwrap()).unwrap_err().to_string()
+}
+
+#[test]
+fn a_checkpoint_comes_back_whole() {
+    for method in MethodKind::ALL {
+        let agent = Agent::new(small_config(method), 5);
+        let bytes = checkpoint::to_bytes(&agent, &provenance()).unwrap();
+        let loaded = checkpoint::from_bytes(&bytes).unwrap();
+        assert_eq!(loaded.agent.config(), agent.config());
+        assert_eq!(loaded.provenance, provenance());
+        let x = agent.encode(&noise_images(1, 1));
+        assert_eq!(loaded.agent.encode(&noise_images(1, 1)), x);
+        assert_eq!(loaded.agent.plan(&x, &x, 0).actions, agent.plan(&x, &x, 0).actions);
+        assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
+        assert_eq!(loaded.digest, checkpoint::digest(&bytes));
+    }
+}
+
+#[test]
+fn a_truncated_file_is_refused() {
+    let bytes = saved();
+    for length in [0, 7, 100, bytes.len() - 1] {
+        assert!(checkpoint::from_bytes(&bytes[..length]).unwrap_err().to_string().contains("safetensors"));
+    }
+}
+
+#[test]
+fn noise_is_refused() {
+    assert!(checkpoint::from_bytes(&[0xff; 4096]).is_err());
+}
+
+#[test]
+fn an_oversized_file_is_refused() {
+    let error = checkpoint::from_bytes(&vec![0; checkpoint::MAX_BYTES + 1]).unwrap_err().to_string();
+    assert_eq!(error, "checkpoint: expected at most 67108864 bytes, got 67108865");
+}
+
+#[test]
+fn another_format_is_refused() {
+    assert_eq!(refusal(|_, m| m["format"] = json!(2)), "checkpoint format: expected 1, got 2");
+}
+
+#[test]
+fn a_missing_weight_is_named() {
+    let message = refusal(|tensors, _| drop(tensors.remove("network.trunk.weight")));
+    assert_eq!(message, "checkpoint tensor \"network.trunk.weight\": expected by the model's configuration, got none");
+}
+
+#[test]
+fn an_unknown_weight_is_named() {
+    let message = refusal(|tensors, _| drop(tensors.insert("extra".into(), tch::Tensor::from(1.0f32))));
+    assert_eq!(message, "checkpoint tensor \"extra\": not part of the model's configuration");
+}
+
+#[test]
+fn a_wrong_shape_is_named() {
+    let message = refusal(|_, metadata| metadata["model"]["hidden"] = json!(9));
+    assert!(message.contains("expected Float[") && message.contains("got Float["), "{message}");
+}
+
+#[test]
+fn a_wrong_kind_is_named() {
+    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), tch::Tensor::from(1.0f64))));
+    assert_eq!(message, "checkpoint tensor \"step_size\": expected Float[], got Double[]");
+}
+
+#[test]
+fn a_weight_that_is_not_a_number_is_named() {
+    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), tch::Tensor::from(f32::NAN))));
+    assert_eq!(message, "checkpoint tensor \"step_size\": expected finite values, got NaN or infinity");
+}
+
+#[test]
+fn a_configuration_out_of_range_builds_nothing() {
+    let message = refusal(|_, metadata| metadata["model"]["encoder"]["latent"] = json!(1_000_000_000));
+    assert_eq!(message, "checkpoint model: encoder.latent: expected 1 to 1024, got 1000000000");
+    let message = refusal(|_, metadata| metadata["model"]["encoder"]["convolutions"][0]["kernel"] = json!(0));
+    assert_eq!(message, "checkpoint model: encoder.convolutions.kernel: expected 1 to 16, got 0");
+    let message = refusal(|_, metadata| metadata["model"]["depth"] = json!(3));
+    assert!(message.contains("unknown field `depth`"), "{message}");
+}

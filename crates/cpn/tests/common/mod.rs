@@ -1,0 +1,43 @@
+//! Small models and batches for tests.
+
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use cpn::config::ConvConfig;
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tch::Tensor;
+
+/// A model with few weights.
+pub fn small_config(method: MethodKind) -> ModelConfig {
+    let encoder = EncoderConfig {
+        convolutions: vec![
+            ConvConfig { channels: 3, kernel: 8, stride: 8 },
+            ConvConfig { channels: 4, kernel: 4, stride: 3 },
+        ],
+        latent: 6,
+        layer_norm: true,
+    };
+    ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) }
+}
+
+/// An agent in float64, so that gradients can be told from rounding.
+pub fn double_agent(config: ModelConfig) -> Agent {
+    let mut agent = Agent::new(config, 3);
+    agent.variables_mut().double();
+    agent
+}
+
+/// Images of noise, `[B, 84, 84, 3]`.
+pub fn noise_images(batch: i64, seed: u64) -> Tensor {
+    let mut data = vec![0; batch as usize * cpn::images::BYTES];
+    ChaCha8Rng::seed_from_u64(seed).fill(data.as_mut_slice());
+    cpn::images::from_bytes(&data).unwrap()
+}
+
+/// Values in [-1, 1), float64.
+pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let values: Vec<f64> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
+    Tensor::from_slice(&values).view(shape)
+}

@@ -1,0 +1,57 @@
+//! The method against golden tensors of an independent PyTorch implementation, `tests/golden/reference.py`.
+
+mod common;
+
+use cpn::archive::{self, Tensors};
+use cpn::{Agent, Method, ModelConfig};
+use tch::{Kind, Tensor};
+
+/// The agent with the reference's weights, in float64, and everything else the reference wrote.
+fn load(method: &str) -> (Agent, Tensors) {
+    let path = format!("{}/../../tests/golden/{method}.safetensors", env!("CARGO_MANIFEST_DIR"));
+    let (tensors, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
+    let agent = common::double_agent(config);
+    for (name, mut variable) in agent.variables().variables() {
+        tch::no_grad(|| variable.copy_(&tensors[&format!("weight.{name}")]));
+    }
+    (agent, tensors)
+}
+
+fn assert_close(name: &str, ours: &Tensor, reference: &Tensor) {
+    assert_eq!(ours.size(), reference.size(), "{name}");
+    let error = (ours - reference).abs().max().double_value(&[]);
+    assert!(error < 1e-10 * (1.0 + reference.abs().max().double_value(&[])), "{name}: {error:e}");
+}
+
+fn check(method: &str) {
+    let (agent, golden) = load(method);
+    let (x, x_g) = (agent.encode(&golden["observations"]), agent.encode(&golden["goals"]));
+    assert_close("x", &x, &golden["x"]);
+    assert_close("x_g", &x_g, &golden["x_g"]);
+
+    let plan = agent.plan(&x, &x_g, 0);
+    assert_close("actions", &plan.actions, &golden["actions"]);
+    assert_close("inner_losses", &Tensor::stack(&plan.inner_losses, 0), &golden["inner_losses"]);
+
+    let loss = agent.outer_loss(
+        &golden["observations"],
+        &golden["goals"],
+        &golden["demonstrated"],
+        &golden["mask"].to_kind(Kind::Double),
+    );
+    assert_close("outer_loss", &loss, &golden["outer_loss"]);
+    loss.backward();
+    for (name, variable) in agent.variables().variables() {
+        assert_close(&name, &variable.grad(), &golden[&format!("gradient.{name}")]);
+    }
+}
+
+#[test]
+fn upn_agrees_with_the_reference() {
+    check("upn");
+}
+
+#[test]
+fn cpn_agrees_with_the_reference() {
+    check("cpn");
+}

@@ -1,0 +1,187 @@
+//! The mathematics of the networks, the inner loop and the outer loop.
+
+mod common;
+
+use common::{double_agent, noise_images, small_config, uniform};
+use cpn::neuromodulated::Neuromodulated;
+use cpn::planner::InnerLoop;
+use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Random};
+use tch::nn::{self, Module};
+use tch::{Device, Kind, Tensor};
+
+fn max_difference(a: &Tensor, b: &Tensor) -> f64 {
+    (a - b).abs().max().double_value(&[])
+}
+
+/// A batch for the outer loss: observations, goals, demonstrated actions, mask.
+fn batch(config: &ModelConfig, size: i64) -> (Tensor, Tensor, Tensor, Tensor) {
+    let (observations, goals) = (noise_images(size, 1), noise_images(size, 2));
+    let actions = uniform(&[size, config.horizon, config.actions], 3);
+    (observations, goals, actions, Tensor::ones([size, config.horizon], (Kind::Double, Device::Cpu)))
+}
+
+/// The outer gradient, which for planning methods is of second order, against central differences, at the largest
+/// components of every weight tensor.
+#[test]
+fn outer_gradients_match_finite_differences() {
+    for method in MethodKind::ALL {
+        let agent = double_agent(small_config(method));
+        let (observations, goals, actions, mask) = batch(agent.config(), 3);
+        let loss = || agent.outer_loss(&observations, &goals, &actions, &mask);
+        loss().backward();
+        let mut seen = 0;
+        for (name, variable) in agent.variables().variables() {
+            if !variable.grad().defined() {
+                assert_eq!(name, "step_size", "{method}: every other weight takes part");
+                continue;
+            }
+            let gradient = variable.grad().view(-1);
+            let index = gradient.abs().argmax(None, false).int64_value(&[]);
+            let mut weight = variable.detach().view(-1).get(index);
+            let mut nudged = |delta: f64| {
+                weight += delta;
+                let value = loss().double_value(&[]);
+                weight -= delta;
+                value
+            };
+            let numeric = (nudged(1e-6) - nudged(-1e-6)) / 2e-6;
+            let analytic = gradient.double_value(&[index]);
+            assert!(
+                (numeric - analytic).abs() < 1e-6 + 1e-4 * analytic.abs(),
+                "{method} {name}[{index}]: {numeric} by differences, {analytic} by the graph"
+            );
+            seen += 1;
+        }
+        assert!(seen > 8, "{method}");
+    }
+}
+
+#[test]
+fn the_step_size_learns_through_the_update() {
+    for method in [MethodKind::Upn, MethodKind::Cpn] {
+        let agent = double_agent(small_config(method));
+        let (observations, goals, actions, mask) = batch(agent.config(), 2);
+        agent.outer_loss(&observations, &goals, &actions, &mask).backward();
+        let gradient = agent.variables().variables()["step_size"].grad().double_value(&[]);
+        assert!(gradient.abs() > 0.0, "{method}: the outer loss must depend on the inner update");
+    }
+}
+
+#[test]
+fn a_plan_does_not_depend_on_its_batch() {
+    for method in MethodKind::ALL {
+        let agent = double_agent(small_config(method));
+        let (x, x_g) = (uniform(&[7, 6], 1), uniform(&[7, 6], 2));
+        let together = agent.plan(&x, &x_g, 0);
+        for row in 0..7 {
+            let alone = agent.plan(&x.narrow(0, row, 1), &x_g.narrow(0, row, 1), 0);
+            assert!(max_difference(&alone.actions, &together.actions.narrow(0, row, 1)) < 1e-12, "{method}");
+            for (a, b) in alone.inner_losses.iter().zip(&together.inner_losses) {
+                assert!(max_difference(a, &b.narrow(0, row, 1)) < 1e-12, "{method}");
+            }
+        }
+    }
+}
+
+#[test]
+fn training_and_serving_plan_alike() {
+    let agent = double_agent(small_config(MethodKind::Cpn));
+    let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
+    let inner_loop = InnerLoop { updates: 3, ..agent.inner_loop() };
+    let served = inner_loop.plan(&x, &x_g);
+    let trained = inner_loop.plan_differentiably(&x, &x_g);
+    assert!(max_difference(&served.actions, &trained.actions) < 1e-12);
+    assert_eq!((served.inner_losses.len(), trained.inner_losses.len()), (4, 3));
+}
+
+#[test]
+fn without_updates_the_plan_is_the_policys_rollout() {
+    let agent = double_agent(small_config(MethodKind::Cpn));
+    let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
+    let planned = InnerLoop { updates: 0, ..agent.inner_loop() }.plan(&x, &x_g).actions;
+    let network = agent.inner_loop().network;
+    let mut state = x;
+    for step in 0..agent.horizon() {
+        let features = network.features(&state, &x_g);
+        let action = network.policy(&features);
+        assert!(max_difference(&planned.select(1, step), &action) < 1e-12);
+        state = network.next(&state, &features, &action);
+    }
+}
+
+#[test]
+fn a_small_update_lowers_the_inner_loss() {
+    for method in [MethodKind::Upn, MethodKind::Cpn] {
+        let agent = double_agent(small_config(method));
+        let step_size = Tensor::from(1e-3);
+        let inner_loop = InnerLoop { updates: 5, step_size: &step_size, ..agent.inner_loop() };
+        let losses = inner_loop.plan(&uniform(&[4, 6], 1), &uniform(&[4, 6], 2)).inner_losses;
+        for pair in losses.windows(2) {
+            assert!(pair[1].lt_tensor(&pair[0]).all().int64_value(&[]) == 1, "{method}");
+        }
+    }
+}
+
+/// With attenuation forced to 1 everywhere the layer is an ordinary linear one.
+#[test]
+fn an_open_neuromodulated_layer_is_linear() {
+    let mut store = nn::VarStore::new(Device::Cpu);
+    let layer = Neuromodulated::new(&(store.root() / "layer"), 5, 3, 4);
+    store.double();
+    let variables = store.variables();
+    let x = uniform(&[6, 5], 1);
+    let linear = x.matmul(&variables["layer.weight"].tr()) + &variables["layer.bias"];
+    assert!(max_difference(&layer.forward(&x), &linear) > 1e-3, "attenuation must matter to begin with");
+    for gate in ["u", "v"] {
+        let mut bias = variables[&format!("layer.{gate}.output.bias")].shallow_clone();
+        let _ = tch::no_grad(|| bias.fill_(1e3));
+    }
+    assert!(max_difference(&layer.forward(&x), &linear) < 1e-12);
+}
+
+#[test]
+fn each_method_sees_what_it_should() {
+    for method in MethodKind::ALL {
+        let agent = double_agent(small_config(method));
+        let [x, goal_a, goal_b] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
+        let change = max_difference(&agent.plan(&x, &goal_a, 0).actions, &agent.plan(&x, &goal_b, 0).actions);
+        assert_eq!(change > 0.0, method != MethodKind::Bc, "{method}: only BC ignores the goal");
+        let moved = agent.plan(&(&x + 0.1), &goal_a, 0).actions;
+        assert!(max_difference(&moved, &agent.plan(&x, &goal_a, 0).actions) > 0.0, "{method}");
+    }
+}
+
+#[test]
+fn steps_past_the_demonstration_do_not_count() {
+    let agent = double_agent(small_config(MethodKind::Cpn));
+    let (observations, goals, actions, mask) = batch(agent.config(), 2);
+    let _ = mask.get(1).narrow(0, 2, 3).fill_(0.0);
+    let loss = |actions: &Tensor| agent.outer_loss(&observations, &goals, actions, &mask).double_value(&[]);
+    let before = loss(&actions);
+    let _ = actions.get(1).narrow(0, 2, 3).fill_(9.0);
+    assert!((loss(&actions) - before).abs() < 1e-12);
+}
+
+#[test]
+fn random_actions_follow_the_seed() {
+    let random = Random { actions: 4 };
+    let x = random.encode(&noise_images(1, 0));
+    let plan = |seed| random.plan(&x, &x, seed).actions;
+    assert_eq!(plan(1), plan(1));
+    assert_ne!(plan(1), plan(2));
+    assert!(plan(1).abs().max().double_value(&[]) <= 1.0);
+}
+
+#[test]
+fn every_preset_builds() {
+    for encoder in [EncoderConfig::paper(), EncoderConfig::upn()] {
+        for method in MethodKind::ALL {
+            let config = ModelConfig { encoder: encoder.clone(), ..ModelConfig::paper(method) };
+            config.validate().unwrap();
+            let agent = Agent::new(config, 0);
+            let x = agent.encode(&noise_images(2, 0));
+            assert_eq!(x.size(), [2, encoder.latent]);
+            assert_eq!(agent.plan(&x, &x, 0).actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
+        }
+    }
+}

@@ -1,0 +1,8 @@
+//! What every service needs around its work: configuration, logs, shutdown, a zenoh session.
+
+pub mod config;
+pub mod session;
+pub mod shutdown;
+pub mod telemetry;
+
+pub use session::SessionConfig;

@@ -1,0 +1,62 @@
+//! Every zenoh key, once. The verbatim chunk `@v1` seals the version: `cpn/**` does not match it.
+//!
+//! Each function takes the variable chunks of its key; `"*"` selects all of them.
+
+use crate::Error;
+use zenoh::key_expr::{OwnedKeyExpr, keyexpr};
+
+macro_rules! keys {
+    ($($(#[$doc:meta])* $name:ident($($chunk:ident),+) = $format:literal;)+) => {
+        mod format {
+            zenoh::key_expr::format::kedefine!($(pub(super) $name: $format),+);
+        }
+        $(
+            $(#[$doc])*
+            ///
+            /// # Errors
+            /// If a name cannot stand in a key.
+            pub fn $name($($chunk: &str),+) -> Result<OwnedKeyExpr, Error> {
+                zenoh::key_expr::format::keformat!(format::$name::formatter(), $($chunk = $chunk),+).map_err(|_| {
+                    let got = [$(format!("{:?}", $chunk)),+].join(", ");
+                    Error::invalid(stringify!($name), concat!("chunks for the key ", $format), got)
+                })
+            }
+        )+
+    };
+}
+
+keys! {
+    /// Queryable: [`crate::planner::PlanRequest`].
+    planner_plan(planner) = "cpn/@v1/planner/${planner:*}/plan";
+    /// Queryable: [`crate::planner::RegisterGoalRequest`].
+    planner_register_goal(planner) = "cpn/@v1/planner/${planner:*}/register_goal";
+    /// Queryable: [`crate::planner::LoadModelRequest`].
+    planner_load_model(planner) = "cpn/@v1/planner/${planner:*}/load_model";
+    /// Queryable: [`crate::planner::ListModelsRequest`].
+    planner_list_models(planner) = "cpn/@v1/planner/${planner:*}/list_models";
+    /// Queryable: [`crate::sim::ResetRequest`].
+    sim_reset(worker) = "cpn/@v1/sim/${worker:*}/reset";
+    /// Queryable: [`crate::sim::StepRequest`].
+    sim_step(worker) = "cpn/@v1/sim/${worker:*}/step";
+    /// Published frames, for watchers.
+    sim_frame(worker) = "cpn/@v1/sim/${worker:*}/frame";
+    /// Published actions, for watchers.
+    sim_action(worker) = "cpn/@v1/sim/${worker:*}/action";
+    /// Published [`crate::demonstration::DemonstrationStep`].
+    demonstration_step(episode, step) = "cpn/@v1/demonstration/${episode:*}/step/${step:*}";
+    /// Queryable: [`crate::demonstration::CommitEpisodeRequest`].
+    demonstration_commit(episode) = "cpn/@v1/demonstration/${episode:*}/commit";
+    /// Published [`crate::checkpoint::CheckpointAnnouncement`].
+    checkpoint_announcement(model) = "cpn/@v1/checkpoint/${model:*}/announcement";
+    /// Queryable: [`crate::checkpoint::CheckpointChunkRequest`].
+    checkpoint_chunk(digest) = "cpn/@v1/checkpoint/${digest:*}/chunk";
+    /// Liveliness token of a planner.
+    planner_alive(planner) = "cpn/@v1/alive/planner/${planner:*}";
+    /// Liveliness token of a simulator worker.
+    sim_alive(worker) = "cpn/@v1/alive/sim/${worker:*}";
+}
+
+/// The worker's name in the key of its liveliness token.
+pub fn worker_of_sim_alive(key: &keyexpr) -> Option<String> {
+    Some(format::sim_alive::parse(key).ok()?.worker().to_string())
+}

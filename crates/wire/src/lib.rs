@@ -1,0 +1,27 @@
+//! Everything that crosses the network: protobuf messages, their native types, zenoh keys, and queries.
+//!
+//! Bytes become native types here and nowhere else: [`decode`] bounds the size, parses, and checks every field, so that
+//! the services see valid values only. Each message has both directions, held to each other by a property test.
+
+pub mod checkpoint;
+pub mod demonstration;
+mod error;
+mod image;
+pub mod key;
+mod message;
+pub mod planner;
+pub mod query;
+pub mod sim;
+
+pub use error::{Code, Error};
+pub use image::Image;
+pub use message::{Message, decode, encode};
+
+/// The generated protobuf types.
+#[allow(missing_docs, clippy::all, reason = "generated code")]
+pub mod proto {
+    tonic::include_proto!("cpn.v1");
+
+    /// The encoded `FileDescriptorSet` of every message, for gRPC reflection.
+    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+}

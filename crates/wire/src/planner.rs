@@ -1,0 +1,343 @@
+//! Requests to the planner service and its answers.
+
+use crate::message::{action, digest, name, required};
+use crate::{Error, Image, Message, proto};
+use std::time::Duration;
+
+/// Where to plan to.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Goal {
+    /// A goal registered before.
+    Id(String),
+    /// A picture of the finished task.
+    Image(Image),
+}
+
+/// Asks for the next actions towards a goal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlanRequest {
+    /// Name of the model.
+    pub model: String,
+    /// Where to plan to.
+    pub goal: Goal,
+    /// What the camera shows now.
+    pub observation: Image,
+    /// Drives whatever is random in the model.
+    pub seed: u64,
+    /// How long after its arrival the answer is still of use, in whole milliseconds.
+    pub deadline: Option<Duration>,
+}
+
+/// A plan.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlanResponse {
+    /// The whole sequence, horizon long; not clipped.
+    pub actions: Vec<Vec<f32>>,
+    /// The action to apply now, each value in [-1, 1].
+    pub first_action: Vec<f32>,
+    /// The inner loss before each update and after the last; empty for methods that do not plan.
+    pub inner_losses: Vec<f32>,
+    /// Euclidean distance between the observation's and the goal's embedding; none for the random method.
+    pub latent_distance: Option<f32>,
+    /// Where the time went.
+    pub times: StageTimes,
+    /// SHA-256 of the checkpoint that answered, in hex.
+    pub model_digest: String,
+    /// Id under which the goal is now registered.
+    pub goal_id: String,
+}
+
+/// Where the time of a request went, in seconds.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StageTimes {
+    /// Waiting for the model.
+    pub queue_seconds: f64,
+    /// Embedding the observation and, if it was not cached, the goal.
+    pub encode_seconds: f64,
+    /// Planning.
+    pub plan_seconds: f64,
+}
+
+/// Keeps a goal image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RegisterGoalRequest {
+    /// A picture of the finished task.
+    pub image: Image,
+}
+
+/// The id of a kept goal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RegisterGoalResponse {
+    /// [`Image::digest`].
+    pub goal_id: String,
+}
+
+/// Where a checkpoint comes from.
+#[derive(Debug, Clone, PartialEq)]
+pub enum CheckpointSource {
+    /// A file name inside the planner's own model folder.
+    File(String),
+    /// A whole checkpoint.
+    Bytes(Vec<u8>),
+}
+
+/// Swaps in another checkpoint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadModelRequest {
+    /// Name to serve the model under.
+    pub model: String,
+    /// Where the checkpoint comes from.
+    pub source: CheckpointSource,
+}
+
+/// The model that is now served.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadModelResponse {
+    /// What is known of it.
+    pub model: ModelInfo,
+}
+
+/// Asks for the served models.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ListModelsRequest;
+
+/// The served models.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ListModelsResponse {
+    /// Ordered by name.
+    pub models: Vec<ModelInfo>,
+}
+
+/// A served model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelInfo {
+    /// Name it is served under.
+    pub name: String,
+    /// `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    pub method: String,
+    /// SHA-256 of its checkpoint, in hex.
+    pub digest: String,
+    /// Tasks it was trained on.
+    pub training_tasks: Vec<String>,
+    /// Number of actions in a plan.
+    pub horizon: u32,
+}
+
+impl Message for PlanRequest {
+    type Proto = proto::PlanRequest;
+}
+
+impl TryFrom<proto::PlanRequest> for PlanRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::PlanRequest) -> Result<Self, Error> {
+        let goal = match request.goal.ok_or_else(|| Error::missing("goal"))? {
+            proto::plan_request::Goal::GoalId(id) => Goal::Id(digest("goal_id", id)?),
+            proto::plan_request::Goal::GoalImage(image) => {
+                Goal::Image(image.try_into().map_err(|e: Error| e.within("goal_image"))?)
+            }
+        };
+        Ok(Self {
+            model: name("model", request.model)?,
+            goal,
+            observation: required("observation", request.observation)?,
+            seed: request.seed,
+            deadline: (request.deadline_ms > 0).then(|| Duration::from_millis(request.deadline_ms.into())),
+        })
+    }
+}
+
+impl From<PlanRequest> for proto::PlanRequest {
+    fn from(request: PlanRequest) -> Self {
+        Self {
+            model: request.model,
+            goal: Some(match request.goal {
+                Goal::Id(id) => proto::plan_request::Goal::GoalId(id),
+                Goal::Image(image) => proto::plan_request::Goal::GoalImage(image.into()),
+            }),
+            observation: Some(request.observation.into()),
+            seed: request.seed,
+            deadline_ms: request.deadline.map_or(0, |d| u32::try_from(d.as_millis()).unwrap_or(u32::MAX)),
+        }
+    }
+}
+
+impl Message for PlanResponse {
+    type Proto = proto::PlanResponse;
+}
+
+impl TryFrom<proto::PlanResponse> for PlanResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::PlanResponse) -> Result<Self, Error> {
+        let first_action = response.first_action.ok_or_else(|| Error::missing("first_action"))?;
+        let times = response.times.unwrap_or_default();
+        Ok(Self {
+            actions: response
+                .actions
+                .into_iter()
+                .map(action)
+                .collect::<Result<_, _>>()
+                .map_err(|e| e.within("actions"))?,
+            first_action: action(first_action).map_err(|e| e.within("first_action"))?,
+            inner_losses: response.inner_losses,
+            latent_distance: response.latent_distance,
+            times: StageTimes {
+                queue_seconds: times.queue_seconds,
+                encode_seconds: times.encode_seconds,
+                plan_seconds: times.plan_seconds,
+            },
+            model_digest: digest("model_digest", response.model_digest)?,
+            goal_id: digest("goal_id", response.goal_id)?,
+        })
+    }
+}
+
+impl From<PlanResponse> for proto::PlanResponse {
+    fn from(response: PlanResponse) -> Self {
+        let StageTimes { queue_seconds, encode_seconds, plan_seconds } = response.times;
+        Self {
+            actions: response.actions.into_iter().map(|values| proto::Action { values }).collect(),
+            first_action: Some(proto::Action { values: response.first_action }),
+            inner_losses: response.inner_losses,
+            latent_distance: response.latent_distance,
+            times: Some(proto::StageTimes { queue_seconds, encode_seconds, plan_seconds }),
+            model_digest: response.model_digest,
+            goal_id: response.goal_id,
+        }
+    }
+}
+
+impl Message for RegisterGoalRequest {
+    type Proto = proto::RegisterGoalRequest;
+}
+
+impl TryFrom<proto::RegisterGoalRequest> for RegisterGoalRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::RegisterGoalRequest) -> Result<Self, Error> {
+        Ok(Self { image: required("image", request.image)? })
+    }
+}
+
+impl From<RegisterGoalRequest> for proto::RegisterGoalRequest {
+    fn from(request: RegisterGoalRequest) -> Self {
+        Self { image: Some(request.image.into()) }
+    }
+}
+
+impl Message for RegisterGoalResponse {
+    type Proto = proto::RegisterGoalResponse;
+}
+
+impl TryFrom<proto::RegisterGoalResponse> for RegisterGoalResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::RegisterGoalResponse) -> Result<Self, Error> {
+        Ok(Self { goal_id: digest("goal_id", response.goal_id)? })
+    }
+}
+
+impl From<RegisterGoalResponse> for proto::RegisterGoalResponse {
+    fn from(response: RegisterGoalResponse) -> Self {
+        Self { goal_id: response.goal_id }
+    }
+}
+
+impl Message for LoadModelRequest {
+    type Proto = proto::LoadModelRequest;
+    const MAX_BYTES: usize = 65 << 20;
+}
+
+impl TryFrom<proto::LoadModelRequest> for LoadModelRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::LoadModelRequest) -> Result<Self, Error> {
+        let source = match request.source.ok_or_else(|| Error::missing("source"))? {
+            proto::load_model_request::Source::File(file) => CheckpointSource::File(name("file", file)?),
+            proto::load_model_request::Source::Checkpoint(bytes) => CheckpointSource::Bytes(bytes),
+        };
+        Ok(Self { model: name("model", request.model)?, source })
+    }
+}
+
+impl From<LoadModelRequest> for proto::LoadModelRequest {
+    fn from(request: LoadModelRequest) -> Self {
+        let source = match request.source {
+            CheckpointSource::File(file) => proto::load_model_request::Source::File(file),
+            CheckpointSource::Bytes(bytes) => proto::load_model_request::Source::Checkpoint(bytes),
+        };
+        Self { model: request.model, source: Some(source) }
+    }
+}
+
+impl Message for LoadModelResponse {
+    type Proto = proto::LoadModelResponse;
+}
+
+impl TryFrom<proto::LoadModelResponse> for LoadModelResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::LoadModelResponse) -> Result<Self, Error> {
+        Ok(Self { model: required("model", response.model)? })
+    }
+}
+
+impl From<LoadModelResponse> for proto::LoadModelResponse {
+    fn from(response: LoadModelResponse) -> Self {
+        Self { model: Some(response.model.into()) }
+    }
+}
+
+impl Message for ListModelsRequest {
+    type Proto = proto::ListModelsRequest;
+}
+
+impl TryFrom<proto::ListModelsRequest> for ListModelsRequest {
+    type Error = Error;
+
+    fn try_from(_: proto::ListModelsRequest) -> Result<Self, Error> {
+        Ok(Self)
+    }
+}
+
+impl From<ListModelsRequest> for proto::ListModelsRequest {
+    fn from(_: ListModelsRequest) -> Self {
+        Self {}
+    }
+}
+
+impl Message for ListModelsResponse {
+    type Proto = proto::ListModelsResponse;
+}
+
+impl TryFrom<proto::ListModelsResponse> for ListModelsResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::ListModelsResponse) -> Result<Self, Error> {
+        let models = response.models.into_iter().map(ModelInfo::try_from).collect::<Result<_, _>>();
+        Ok(Self { models: models.map_err(|e| e.within("models"))? })
+    }
+}
+
+impl From<ListModelsResponse> for proto::ListModelsResponse {
+    fn from(response: ListModelsResponse) -> Self {
+        Self { models: response.models.into_iter().map(Into::into).collect() }
+    }
+}
+
+impl TryFrom<proto::ModelInfo> for ModelInfo {
+    type Error = Error;
+
+    fn try_from(info: proto::ModelInfo) -> Result<Self, Error> {
+        let proto::ModelInfo { name: model, method, digest: sha256, training_tasks, horizon } = info;
+        Ok(Self { name: name("name", model)?, method, digest: digest("digest", sha256)?, training_tasks, horizon })
+    }
+}
+
+impl From<ModelInfo> for proto::ModelInfo {
+    fn from(info: ModelInfo) -> Self {
+        let ModelInfo { name, method, digest, training_tasks, horizon } = info;
+        Self { name, method, digest, training_tasks, horizon }
+    }
+}

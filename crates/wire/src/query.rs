@@ -1,0 +1,79 @@
+//! Request and reply over zenoh queries, typed on both sides.
+
+use crate::{Code, Error, Message, decode, encode, proto};
+use prost::{Message as _, Name};
+use std::time::Duration;
+use zenoh::bytes::Encoding;
+use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::query::{ConsolidationMode, Query};
+use zenoh::{Session, Wait};
+
+/// The encoding that marks a payload as message `N`.
+pub fn encoding<N: Name>() -> Encoding {
+    Encoding::APPLICATION_PROTOBUF.with_schema(N::full_name())
+}
+
+/// Sends a request and awaits its one answer.
+///
+/// # Errors
+/// What the service answered; [`Code::Unavailable`] if nobody serves the key; [`Code::DeadlineExceeded`] if no answer
+/// came in time.
+pub async fn call<Q: Message, R: Message>(
+    session: &Session,
+    key: &OwnedKeyExpr,
+    request: Q,
+    timeout: Duration,
+) -> Result<R, Error> {
+    let unavailable = |e: zenoh::Error| Error::new(Code::Unavailable, key.as_str(), "an answer", e);
+    let replies = session
+        .get(key)
+        .payload(encode(request))
+        .encoding(encoding::<Q::Proto>())
+        .consolidation(ConsolidationMode::None)
+        .timeout(timeout)
+        .await
+        .map_err(unavailable)?;
+    // Right after a reconnect a query can end at once without any reply.
+    let Ok(reply) = replies.recv_async().await else {
+        return Err(Error::new(Code::Unavailable, key.as_str(), "a service", "none connected"));
+    };
+    match reply.into_result() {
+        Ok(sample) => decode(&sample.payload().to_bytes()),
+        Err(error) if *error.encoding() == encoding::<proto::Error>() => {
+            Err(proto::Error::decode(&*error.payload().to_bytes())
+                .map_or_else(|e| Error::new(Code::Internal, "error", "cpn.v1.Error", e), Error::from))
+        }
+        // Zenoh's own error replies are plain text; the one it sends is "Timeout".
+        Err(_) => Err(Error::new(
+            Code::DeadlineExceeded,
+            key.as_str(),
+            format!("an answer within {} ms", timeout.as_millis()),
+            "none",
+        )),
+    }
+}
+
+/// The request in a query.
+///
+/// # Errors
+/// If its payload is missing or wrong.
+pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
+    let payload = query.payload().ok_or_else(|| Error::missing("payload"))?;
+    decode(&payload.to_bytes())
+}
+
+/// Answers a query, with the value or the error.
+///
+/// # Errors
+/// If zenoh cannot send it.
+pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Result<()> {
+    match result {
+        Ok(response) => {
+            query.reply(query.key_expr(), encode(response)).encoding(encoding::<R::Proto>()).wait()
+        }
+        Err(error) => query
+            .reply_err(proto::Error::from(error).encode_to_vec())
+            .encoding(encoding::<proto::Error>())
+            .wait(),
+    }
+}

@@ -1,0 +1,168 @@
+//! Requests to a simulator worker and its answers.
+
+use crate::message::{action, required};
+use crate::{Error, Image, Message, proto};
+
+/// The randomised object positions of an episode.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Variation {
+    /// Name of the task.
+    pub task: String,
+    /// What the positions are drawn from.
+    pub seed: u64,
+}
+
+/// Starts an episode.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ResetRequest {
+    /// Which one.
+    pub variation: Variation,
+}
+
+/// A started episode.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ResetResponse {
+    /// Names the episode in every following step.
+    pub episode_id: String,
+    /// Last frame of an expert run of the same variation.
+    pub goal: Image,
+    /// First frame.
+    pub observation: Image,
+    /// The episode ends after this many steps at the latest.
+    pub max_steps: u32,
+}
+
+/// Applies one action, exactly once.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepRequest {
+    /// The episode.
+    pub episode_id: String,
+    /// Steps applied before this one.
+    pub step: u32,
+    /// Each value in [-1, 1].
+    pub action: Vec<f32>,
+}
+
+/// What an action led to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepResponse {
+    /// The frame after the action.
+    pub observation: Image,
+    /// Meta-World's reward.
+    pub reward: f64,
+    /// Whether the task is solved, at this step or any before it.
+    pub success: bool,
+    /// Whether the episode is over.
+    pub done: bool,
+}
+
+impl TryFrom<proto::Variation> for Variation {
+    type Error = Error;
+
+    fn try_from(variation: proto::Variation) -> Result<Self, Error> {
+        Ok(Self { task: crate::message::name("task", variation.task)?, seed: variation.seed })
+    }
+}
+
+impl From<Variation> for proto::Variation {
+    fn from(variation: Variation) -> Self {
+        Self { task: variation.task, seed: variation.seed }
+    }
+}
+
+impl Message for ResetRequest {
+    type Proto = proto::ResetRequest;
+}
+
+impl TryFrom<proto::ResetRequest> for ResetRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::ResetRequest) -> Result<Self, Error> {
+        Ok(Self { variation: required("variation", request.variation)? })
+    }
+}
+
+impl From<ResetRequest> for proto::ResetRequest {
+    fn from(request: ResetRequest) -> Self {
+        Self { variation: Some(request.variation.into()) }
+    }
+}
+
+impl Message for ResetResponse {
+    type Proto = proto::ResetResponse;
+}
+
+impl TryFrom<proto::ResetResponse> for ResetResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::ResetResponse) -> Result<Self, Error> {
+        Ok(Self {
+            episode_id: response.episode_id,
+            goal: required("goal", response.goal)?,
+            observation: required("observation", response.observation)?,
+            max_steps: response.max_steps,
+        })
+    }
+}
+
+impl From<ResetResponse> for proto::ResetResponse {
+    fn from(response: ResetResponse) -> Self {
+        Self {
+            episode_id: response.episode_id,
+            goal: Some(response.goal.into()),
+            observation: Some(response.observation.into()),
+            max_steps: response.max_steps,
+        }
+    }
+}
+
+impl Message for StepRequest {
+    type Proto = proto::StepRequest;
+}
+
+impl TryFrom<proto::StepRequest> for StepRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::StepRequest) -> Result<Self, Error> {
+        let values = request.action.ok_or_else(|| Error::missing("action"))?;
+        Ok(Self {
+            episode_id: request.episode_id,
+            step: request.step,
+            action: action(values).map_err(|e| e.within("action"))?,
+        })
+    }
+}
+
+impl From<StepRequest> for proto::StepRequest {
+    fn from(request: StepRequest) -> Self {
+        Self {
+            episode_id: request.episode_id,
+            step: request.step,
+            action: Some(proto::Action { values: request.action }),
+        }
+    }
+}
+
+impl Message for StepResponse {
+    type Proto = proto::StepResponse;
+}
+
+impl TryFrom<proto::StepResponse> for StepResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::StepResponse) -> Result<Self, Error> {
+        Ok(Self {
+            observation: required("observation", response.observation)?,
+            reward: response.reward,
+            success: response.success,
+            done: response.done,
+        })
+    }
+}
+
+impl From<StepResponse> for proto::StepResponse {
+    fn from(response: StepResponse) -> Self {
+        let StepResponse { observation, reward, success, done } = response;
+        Self { observation: Some(observation.into()), reward, success, done }
+    }
+}

@@ -1,0 +1,48 @@
+//! The keys are those of `tests/golden/keys.json`, to which the Python package is held too.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+use serde_json::Value;
+use std::collections::BTreeMap;
+use wire::key;
+
+#[test]
+fn keys_are_the_ones_agreed_upon() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/keys.json");
+    let golden: BTreeMap<String, Value> = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+    for (name, entry) in &golden {
+        let chunk = |argument: &str| entry["arguments"][argument].to_string().trim_matches('"').to_owned();
+        let key = match name.as_str() {
+            "sim_reset" => key::sim_reset(&chunk("worker")),
+            "sim_step" => key::sim_step(&chunk("worker")),
+            "sim_frame" => key::sim_frame(&chunk("worker")),
+            "sim_action" => key::sim_action(&chunk("worker")),
+            "sim_alive" => key::sim_alive(&chunk("worker")),
+            "demonstration_step" => key::demonstration_step(&chunk("episode"), &chunk("step")),
+            "demonstration_commit" => key::demonstration_commit(&chunk("episode")),
+            "planner_plan" => key::planner_plan(&chunk("planner")),
+            "planner_register_goal" => key::planner_register_goal(&chunk("planner")),
+            "planner_load_model" => key::planner_load_model(&chunk("planner")),
+            "planner_list_models" => key::planner_list_models(&chunk("planner")),
+            "planner_alive" => key::planner_alive(&chunk("planner")),
+            "checkpoint_announcement" => key::checkpoint_announcement(&chunk("model")),
+            "checkpoint_chunk" => key::checkpoint_chunk(&chunk("digest")),
+            other => panic!("keys.json names {other}, which is not tested here"),
+        };
+        assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
+    }
+    assert_eq!(golden.len(), 14, "every key is in the file");
+}
+
+#[test]
+fn a_name_that_is_no_chunk_is_refused() {
+    let error = key::planner_plan("a/b").unwrap_err();
+    assert_eq!((error.field.as_str(), error.got.as_str()), ("planner_plan", "\"a/b\""));
+}
+
+#[test]
+fn the_worker_is_read_from_its_token() {
+    let key = key::sim_alive("w7").unwrap();
+    assert_eq!(key::worker_of_sim_alive(&key).as_deref(), Some("w7"));
+    assert_eq!(key::worker_of_sim_alive(&key::planner_alive("w7").unwrap()), None);
+}

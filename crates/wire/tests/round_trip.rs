@@ -1,0 +1,140 @@
+//! Every message survives the trip to bytes and back, and no bytes make a decoder panic.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+use proptest::collection::vec;
+use proptest::option;
+use proptest::prelude::*;
+use std::time::Duration;
+use wire::checkpoint::*;
+use wire::demonstration::*;
+use wire::planner::*;
+use wire::sim::*;
+use wire::{Image, Message, decode, encode};
+
+fn image() -> impl Strategy<Value = Image> {
+    (1u32..6, 1u32..6).prop_flat_map(|(height, width)| {
+        vec(any::<u8>(), (height * width * 3) as usize)
+            .prop_map(move |data| Image::new(height, width, data).unwrap())
+    })
+}
+
+fn name() -> &'static str {
+    "[a-z0-9_-][a-z0-9._-]{0,20}"
+}
+
+fn digest() -> &'static str {
+    "[0-9a-f]{64}"
+}
+
+fn action() -> impl Strategy<Value = Vec<f32>> {
+    vec(-1.0f32..1.0, 1..6)
+}
+
+fn info() -> impl Strategy<Value = ModelInfo> {
+    (name(), "[a-z-]{2,6}", digest(), vec(name(), 0..3), any::<u32>()).prop_map(
+        |(name, method, digest, training_tasks, horizon)| ModelInfo { name, method, digest, training_tasks, horizon },
+    )
+}
+
+fn variation() -> impl Strategy<Value = Variation> {
+    (name(), any::<u64>()).prop_map(|(task, seed)| Variation { task, seed })
+}
+
+fn survives<M: Message + Clone + PartialEq + std::fmt::Debug>(message: M) {
+    assert_eq!(decode::<M>(&encode(message.clone())).unwrap(), message);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn plan_request(
+        model in name(),
+        goal in prop_oneof![digest().prop_map(Goal::Id), image().prop_map(Goal::Image)],
+        observation in image(),
+        seed: u64,
+        deadline in option::of((1u64..u64::from(u32::MAX)).prop_map(Duration::from_millis)),
+    ) {
+        survives(PlanRequest { model, goal, observation, seed, deadline });
+    }
+
+    #[test]
+    fn plan_response(
+        actions in vec(action(), 0..6),
+        first_action in action(),
+        inner_losses in vec(0.0f32..9.0, 0..4),
+        latent_distance in option::of(0.0f32..9.0),
+        (queue_seconds, encode_seconds, plan_seconds) in (0.0..1.0, 0.0..1.0, 0.0..1.0),
+        model_digest in digest(),
+        goal_id in digest(),
+    ) {
+        let times = StageTimes { queue_seconds, encode_seconds, plan_seconds };
+        survives(PlanResponse { actions, first_action, inner_losses, latent_distance, times, model_digest, goal_id });
+    }
+
+    #[test]
+    fn goals_and_models(
+        image in image(),
+        goal_id in digest(),
+        model in name(),
+        source in prop_oneof![
+            name().prop_map(CheckpointSource::File),
+            vec(any::<u8>(), 0..50).prop_map(CheckpointSource::Bytes),
+        ],
+        models in vec(info(), 0..3),
+        info in info(),
+    ) {
+        survives(RegisterGoalRequest { image });
+        survives(RegisterGoalResponse { goal_id });
+        survives(LoadModelRequest { model, source });
+        survives(LoadModelResponse { model: info });
+        survives(ListModelsRequest);
+        survives(ListModelsResponse { models });
+    }
+
+    #[test]
+    fn simulator(
+        variation in variation(),
+        episode_id in name(),
+        (goal, observation) in (image(), image()),
+        step: u32,
+        action in action(),
+        reward in -9.0..9.0,
+        (success, done): (bool, bool),
+    ) {
+        survives(ResetRequest { variation });
+        survives(StepRequest { episode_id: episode_id.clone(), step, action });
+        survives(StepResponse { observation: observation.clone(), reward, success, done });
+        survives(ResetResponse { episode_id, goal, observation, max_steps: step });
+    }
+
+    #[test]
+    fn demonstrations_and_checkpoints(
+        variation in variation(),
+        episode_id in name(),
+        frame in image(),
+        action in option::of(action()),
+        (step, steps) in (0..MAX_STEPS, 2..=MAX_STEPS),
+        missing_steps in vec(any::<u32>(), 0..5),
+        (model, digest, size_bytes) in (name(), digest(), any::<u64>()),
+        (offset_bytes, length_bytes) in (any::<u64>(), 1..=MAX_CHUNK_BYTES),
+        data in vec(any::<u8>(), 0..50),
+    ) {
+        survives(DemonstrationStep { episode_id: episode_id.clone(), step, frame, action });
+        survives(CommitEpisodeRequest { episode_id, variation, steps });
+        survives(CommitEpisodeResponse { missing_steps });
+        survives(CheckpointAnnouncement { model, digest, size_bytes });
+        survives(CheckpointChunkRequest { offset_bytes, length_bytes });
+        survives(CheckpointChunkResponse { data });
+    }
+
+    #[test]
+    fn any_bytes_are_refused_or_decoded(bytes in vec(any::<u8>(), 0..200)) {
+        let _ = decode::<PlanRequest>(&bytes);
+        let _ = decode::<LoadModelRequest>(&bytes);
+        let _ = decode::<ResetResponse>(&bytes);
+        let _ = decode::<DemonstrationStep>(&bytes);
+        let _ = decode::<CommitEpisodeRequest>(&bytes);
+    }
+}

@@ -1,0 +1,100 @@
+"""The one running episode of a worker: the requests' meaning, whatever carries them."""
+
+from dataclasses import dataclass
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cpn.v1 import sim_pb2, types_pb2
+from cpn_sim_worker.expert import ExpertFailedError, run_expert
+from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.tasks import TASKS
+from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto, invalid
+
+
+@dataclass(frozen=True)
+class _Applied:
+    """The latest step, kept to answer its repetition."""
+
+    action: NDArray[np.float32]
+    response: sim_pb2.StepResponse
+
+
+@dataclass
+class _Episode:
+    id: str
+    steps: int = 0
+    success: bool = False
+    done: bool = False
+    latest: _Applied | None = None
+
+
+class EpisodeRunner:
+    """Runs one episode after the other on one simulator."""
+
+    def __init__(self, simulator: Simulator, max_steps: int) -> None:
+        self._simulator = simulator
+        self._max_steps = max_steps
+        self._episode: _Episode | None = None
+
+    def reset(self, request: sim_pb2.ResetRequest) -> sim_pb2.ResetResponse:
+        """Ends the running episode and starts one of the requested variation."""
+        task, seed = request.variation.task, request.variation.seed
+        if task not in TASKS:
+            raise invalid("variation.task", f"one of {', '.join(TASKS)}", repr(task))
+        self.abandon()
+        try:
+            run_expert(self._simulator, task, seed)
+        except ExpertFailedError as error:
+            raise RequestError(
+                types_pb2.ERROR_CODE_FAILED_PRECONDITION,
+                "variation.seed",
+                "a seed whose variation the scripted expert solves, for the goal image",
+                error.seed,
+            ) from None
+        goal = self._simulator.frame()
+        self._simulator.reset(task, seed)
+        self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
+        return sim_pb2.ResetResponse(
+            episode_id=self._episode.id,
+            goal=image_to_proto(goal),
+            observation=image_to_proto(self._simulator.frame()),
+            max_steps=self._max_steps,
+        )
+
+    def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
+        """Applies an action exactly once; the flag tells whether it was applied now or only answered again."""
+        episode = self._episode
+        if episode is None or request.episode_id != episode.id:
+            running = "an episode started by a reset" if episode is None else repr(episode.id)
+            raise RequestError(types_pb2.ERROR_CODE_NOT_FOUND, "episode_id", running, repr(request.episode_id))
+        action = action_from_proto(request.action, "action")
+        latest = episode.latest
+        if latest is not None and request.step == episode.steps - 1 and np.array_equal(action, latest.action):
+            return latest.response, False
+        if episode.done:
+            raise RequestError(
+                types_pb2.ERROR_CODE_FAILED_PRECONDITION,
+                "episode_id",
+                "an episode that goes on",
+                f"one that ended after {episode.steps} steps",
+            )
+        if request.step != episode.steps:
+            raise RequestError(types_pb2.ERROR_CODE_FAILED_PRECONDITION, "step", episode.steps, request.step)
+        transition = self._simulator.step(action)
+        episode.steps += 1
+        episode.success |= transition.success
+        episode.done = episode.success or episode.steps >= self._max_steps
+        response = sim_pb2.StepResponse(
+            observation=image_to_proto(self._simulator.frame()),
+            reward=transition.reward,
+            success=episode.success,
+            done=episode.done,
+        )
+        episode.latest = _Applied(action, response)
+        return response, True
+
+    def abandon(self) -> None:
+        """Ends the running episode, if any: further steps of it are refused."""
+        self._episode = None

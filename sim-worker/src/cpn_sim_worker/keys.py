@@ -1,0 +1,77 @@
+"""Every zenoh key of the project, general to specific.
+
+The verbatim chunk `@v1` seals the version: `cpn/**` does not match it. `tests/golden/keys.json` at the root of the
+repository holds this module and its Rust twin together.
+"""
+
+ROOT = "cpn/@v1"
+
+
+def sim_reset(worker: str) -> str:
+    """Queryable: `ResetRequest` to `ResetResponse`."""
+    return f"{ROOT}/sim/{worker}/reset"
+
+
+def sim_step(worker: str) -> str:
+    """Queryable: `StepRequest` to `StepResponse`."""
+    return f"{ROOT}/sim/{worker}/step"
+
+
+def sim_frame(worker: str) -> str:
+    """Put: `Frame`."""
+    return f"{ROOT}/sim/{worker}/frame"
+
+
+def sim_action(worker: str) -> str:
+    """Put: `AppliedAction`."""
+    return f"{ROOT}/sim/{worker}/action"
+
+
+def sim_alive(worker: str) -> str:
+    """Liveliness token of a worker that is ready."""
+    return f"{ROOT}/alive/sim/{worker}"
+
+
+def demonstration_step(episode: str, step: int | str) -> str:
+    """Put: `DemonstrationStep`. Both arguments may be `*` in a subscription."""
+    return f"{ROOT}/demonstration/{episode}/step/{step}"
+
+
+def demonstration_commit(episode: str) -> str:
+    """Queryable of the trainer: `CommitEpisodeRequest` to `CommitEpisodeResponse`."""
+    return f"{ROOT}/demonstration/{episode}/commit"
+
+
+def planner_plan(planner: str) -> str:
+    """Queryable: `PlanRequest` to `PlanResponse`."""
+    return f"{ROOT}/planner/{planner}/plan"
+
+
+def planner_register_goal(planner: str) -> str:
+    """Queryable: `RegisterGoalRequest` to `RegisterGoalResponse`."""
+    return f"{ROOT}/planner/{planner}/register_goal"
+
+
+def planner_load_model(planner: str) -> str:
+    """Queryable: `LoadModelRequest` to `LoadModelResponse`."""
+    return f"{ROOT}/planner/{planner}/load_model"
+
+
+def planner_list_models(planner: str) -> str:
+    """Queryable: `ListModelsRequest` to `ListModelsResponse`."""
+    return f"{ROOT}/planner/{planner}/list_models"
+
+
+def planner_alive(planner: str) -> str:
+    """Liveliness token of a planner that is ready."""
+    return f"{ROOT}/alive/planner/{planner}"
+
+
+def checkpoint_announcement(model: str) -> str:
+    """Put: `CheckpointAnnouncement`."""
+    return f"{ROOT}/checkpoint/{model}/announcement"
+
+
+def checkpoint_chunk(digest: str) -> str:
+    """Queryable of the trainer: `CheckpointChunkRequest` to `CheckpointChunkResponse`."""
+    return f"{ROOT}/checkpoint/{digest}/chunk"

@@ -1,0 +1,155 @@
+"""Serves one simulator over zenoh."""
+
+import logging
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import zenoh
+from google.protobuf.message import Message
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
+
+from cpn.v1 import sim_pb2, types_pb2
+from cpn_sim_worker import keys
+from cpn_sim_worker.episode import EpisodeRunner
+from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.session import ZenohConfig, open_session
+from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.wire import RequestError, decode, encoding
+
+log = logging.getLogger(__name__)
+
+M = TypeVar("M", bound=Message)
+
+QUEUE_LENGTH = 8
+"""Requests that may wait. One evaluator asks one worker at a time, so more than a few is a client out of control."""
+
+POLL_SECONDS = 0.1
+"""How long a signal to stop may go unnoticed while no request comes."""
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serve Meta-World tasks over zenoh until SIGTERM or SIGINT."""
+
+    worker: str = "w0"
+    """Name of this worker in its keys."""
+    max_steps: int = 150
+    """Steps after which an unsolved episode ends."""
+    zenoh: ZenohConfig = field(default_factory=ZenohConfig)
+
+    def __post_init__(self) -> None:
+        if not self.worker or any(character in "/*$?#" for character in self.worker):
+            raise ValueError(f"worker: expected a name without any of / * $ ? #, got {self.worker!r}")
+        if not 1 <= self.max_steps <= SawyerXYZEnv.max_path_length:
+            raise ValueError(f"max_steps: expected 1 to {SawyerXYZEnv.max_path_length}, got {self.max_steps}")
+
+
+class SimServer:
+    """The zenoh side of a worker: zenoh's threads only enqueue, the thread of `run` simulates and answers."""
+
+    def __init__(self, session: zenoh.Session, worker: str, episodes: EpisodeRunner) -> None:
+        self._session = session
+        self._worker = worker
+        self._episodes = episodes
+        self._queue: queue.Queue[tuple[Callable[[zenoh.Query], None], zenoh.Query]] = queue.Queue(QUEUE_LENGTH)
+        # Watchers get what they can keep up with; the client's answer never waits for them.
+        drop = zenoh.CongestionControl.DROP
+        self._frames = session.declare_publisher(
+            keys.sim_frame(self._worker), encoding=encoding(sim_pb2.Frame), congestion_control=drop
+        )
+        self._actions = session.declare_publisher(
+            keys.sim_action(self._worker), encoding=encoding(sim_pb2.AppliedAction), congestion_control=drop
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Answers requests until `stop` is set."""
+        queryables = [
+            self._declare(keys.sim_reset(self._worker), self._reset),
+            self._declare(keys.sim_step(self._worker), self._step),
+        ]
+        token = self._session.liveliness().declare_token(keys.sim_alive(self._worker))
+        log.info("worker %s is ready", self._worker)
+        while not stop.is_set():
+            try:
+                handle, query = self._queue.get(timeout=POLL_SECONDS)
+            except queue.Empty:
+                continue
+            self._answer(handle, query)
+        token.undeclare()
+        for queryable in queryables:
+            queryable.undeclare()
+        while not self._queue.empty():
+            _, query = self._queue.get()
+            _refuse(query, types_pb2.ERROR_CODE_UNAVAILABLE, "a running worker", "one that is stopping")
+
+    def _declare(self, key: str, handle: Callable[[zenoh.Query], None]) -> zenoh.Queryable[None]:
+        def enqueue(query: zenoh.Query) -> None:
+            try:
+                self._queue.put_nowait((handle, query))
+            except queue.Full:
+                expected = f"at most {QUEUE_LENGTH} waiting requests"
+                _refuse(query, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, expected, "one more")
+
+        return self._session.declare_queryable(key, enqueue, complete=True)
+
+    def _answer(self, handle: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
+        with query:
+            try:
+                handle(query)
+            except RequestError as error:
+                log.warning("refused a request on %s: %s", query.key_expr, error)
+                _reply_error(query, error)
+            except Exception as error:
+                log.exception("a request on %s failed", query.key_expr)
+                # The physics may have advanced although its step never got an answer: nobody may build on it.
+                self._episodes.abandon()
+                _reply_error(query, RequestError(types_pb2.ERROR_CODE_INTERNAL, "", "no fault", repr(error)))
+
+    def _reset(self, query: zenoh.Query) -> None:
+        response = self._episodes.reset(_request(query, sim_pb2.ResetRequest))
+        _reply(query, keys.sim_reset(self._worker), response)
+        self._publish_frame(response.episode_id, 0, response.observation)
+
+    def _step(self, query: zenoh.Query) -> None:
+        request = _request(query, sim_pb2.StepRequest)
+        response, applied = self._episodes.step(request)
+        _reply(query, keys.sim_step(self._worker), response)
+        if applied:
+            action = sim_pb2.AppliedAction(episode_id=request.episode_id, step=request.step, action=request.action)
+            self._actions.put(action.SerializeToString())
+            self._publish_frame(request.episode_id, request.step + 1, response.observation)
+
+    def _publish_frame(self, episode_id: str, step: int, image: types_pb2.Image) -> None:
+        self._frames.put(sim_pb2.Frame(episode_id=episode_id, step=step, image=image).SerializeToString())
+
+
+def _request(query: zenoh.Query, message_type: type[M]) -> M:
+    return decode(message_type, query.payload.to_bytes() if query.payload is not None else b"")
+
+
+def _reply(query: zenoh.Query, key: str, response: Message) -> None:
+    query.reply(key, response.SerializeToString(), encoding=encoding(type(response)))
+
+
+def _reply_error(query: zenoh.Query, error: RequestError) -> None:
+    query.reply_err(error.to_proto().SerializeToString(), encoding=encoding(types_pb2.Error))
+
+
+def _refuse(query: zenoh.Query, code: types_pb2.ErrorCode, expected: str, got: str) -> None:
+    """Answers a query that nobody will work on."""
+    with query:
+        _reply_error(query, RequestError(code, "", expected, got))
+
+
+def serve(config: ServeConfig) -> None:
+    """Serves until SIGTERM or SIGINT."""
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    episodes = EpisodeRunner(Simulator(Renderer()), config.max_steps)
+    with open_session(config.zenoh) as session:
+        SimServer(session, config.worker, episodes).run(stop)

@@ -1,0 +1,98 @@
+"""Conversions between NumPy and the messages of `cpn.v1`, and the error that a message at fault raises."""
+
+from typing import TypeVar
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+from numpy.typing import NDArray
+
+from cpn.v1 import types_pb2
+from cpn_sim_worker.spaces import ACTION_SIZE, IMAGE_SIZE
+
+MAX_PAYLOAD_BYTES = 1 << 20
+"""Far above every message of the project but a whole checkpoint, which no worker receives."""
+
+IMAGE_BYTES = IMAGE_SIZE * IMAGE_SIZE * 3
+
+M = TypeVar("M", bound=Message)
+
+
+class RequestError(Exception):
+    """Why a request was refused; travels as `cpn.v1.Error`."""
+
+    def __init__(self, code: types_pb2.ErrorCode, field: str, expected: object, got: object) -> None:
+        name = types_pb2.ErrorCode.Name(code).removeprefix("ERROR_CODE_")
+        super().__init__(f"{name} {field}: expected {expected}, got {got}")
+        self.code = code
+        self.field = field
+        self.expected = str(expected)
+        self.got = str(got)
+
+    def to_proto(self) -> types_pb2.Error:
+        """The error as a message."""
+        return types_pb2.Error(code=self.code, field=self.field, expected=self.expected, got=self.got)
+
+    @classmethod
+    def from_proto(cls, error: types_pb2.Error) -> "RequestError":
+        """The error that a service answered with."""
+        return cls(error.code, error.field, error.expected, error.got)
+
+
+def invalid(field: str, expected: object, got: object) -> RequestError:
+    """The error of a malformed field."""
+    return RequestError(types_pb2.ERROR_CODE_INVALID_ARGUMENT, field, expected, got)
+
+
+def encoding(message_type: type[Message]) -> str:
+    """The zenoh encoding of a message's bytes."""
+    return f"application/protobuf;{message_type.DESCRIPTOR.full_name}"
+
+
+def decode(message_type: type[M], payload: bytes) -> M:
+    """A message from its bytes.
+
+    Raises:
+        RequestError: If there are too many bytes, or they are no such message.
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise invalid("payload", f"at most {MAX_PAYLOAD_BYTES} bytes", len(payload))
+    message = message_type()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError:
+        raise invalid("payload", message_type.DESCRIPTOR.full_name, f"{len(payload)} other bytes") from None
+    return message
+
+
+def image_to_proto(pixels: NDArray[np.uint8]) -> types_pb2.Image:
+    """An image, [84, 84, 3], as a message."""
+    height, width, _ = pixels.shape
+    return types_pb2.Image(height=height, width=width, format=types_pb2.PIXEL_FORMAT_RGB8, data=pixels.tobytes())
+
+
+def image_from_proto(image: types_pb2.Image, field: str) -> NDArray[np.uint8]:
+    """An image, [84, 84, 3], from its message; `field` names it in a `RequestError`."""
+    if image.format != types_pb2.PIXEL_FORMAT_RGB8:
+        raise invalid(f"{field}.format", "PIXEL_FORMAT_RGB8", image.format)
+    for side in ("height", "width"):
+        if getattr(image, side) != IMAGE_SIZE:
+            raise invalid(f"{field}.{side}", IMAGE_SIZE, getattr(image, side))
+    if len(image.data) != IMAGE_BYTES:
+        raise invalid(f"{field}.data", f"{IMAGE_BYTES} bytes", len(image.data))
+    return np.frombuffer(image.data, np.uint8).reshape(IMAGE_SIZE, IMAGE_SIZE, 3)
+
+
+def action_to_proto(action: NDArray[np.float32]) -> types_pb2.Action:
+    """An action, [4], as a message."""
+    return types_pb2.Action(values=action.tolist())
+
+
+def action_from_proto(action: types_pb2.Action, field: str) -> NDArray[np.float32]:
+    """An action, [4] in [-1, 1], from its message; `field` names it in a `RequestError`."""
+    if len(action.values) != ACTION_SIZE:
+        raise invalid(f"{field}.values", f"{ACTION_SIZE} values", len(action.values))
+    values = np.array(action.values, np.float32)
+    # Written so that NaN, which compares false with everything, is refused too.
+    if not np.all(np.abs(values) <= 1):
+        raise invalid(f"{field}.values", "finite values in [-1, 1]", values.tolist())
+    return values

@@ -1,0 +1,55 @@
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from cpn_sim_worker import keys
+from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.session import ZenohConfig, open_session
+from cpn_sim_worker.simulator import Simulator
+from tests.support import COMMAND, READY_SECONDS, StartWorker, collect, wait_for_sample
+
+
+@pytest.fixture(scope="session")
+def simulator() -> Simulator:
+    """The one simulator with a renderer that this process may hold."""
+    return Simulator(Renderer())
+
+
+@pytest.fixture(scope="session")
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture(scope="session")
+def session(endpoint: str) -> Iterator[zenoh.Session]:
+    """The peer that every process under test connects to."""
+    with open_session(ZenohConfig(listen=(endpoint,))) as session:
+        yield session
+
+
+@pytest.fixture(scope="session")
+def start_worker(session: zenoh.Session, endpoint: str) -> Iterator[StartWorker]:
+    """Starts a serving process and waits until it is ready."""
+    workers: list[subprocess.Popen[bytes]] = []
+
+    def start(name: str, *options: str) -> subprocess.Popen[bytes]:
+        ready = session.liveliness().declare_subscriber(keys.sim_alive(name), collect())
+        process = subprocess.Popen([COMMAND, "serve", "--worker", name, "--connect", endpoint, *options])
+        workers.append(process)
+        wait_for_sample(ready, zenoh.SampleKind.PUT)
+        ready.undeclare()
+        return process
+
+    yield start
+    for process in workers:
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGTERM)
+    for process in workers:
+        assert process.wait(timeout=READY_SECONDS) == 0

@@ -1,0 +1,28 @@
+import queue
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import zenoh
+
+COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker"))
+READY_SECONDS = 60.0
+
+StartWorker = Callable[..., subprocess.Popen[bytes]]
+
+UNSOLVED = ("door-open", 2)
+"""A task and a seed whose variation the scripted expert fails; the next seed's it solves."""
+
+
+def collect() -> tuple[Callable[[zenoh.Sample], None], "queue.Queue[zenoh.Sample]"]:
+    """A handler for a subscriber that keeps its samples in a queue."""
+    samples: queue.Queue[zenoh.Sample] = queue.Queue()
+    return samples.put, samples
+
+
+def wait_for_sample(subscriber: "zenoh.Subscriber[queue.Queue[zenoh.Sample]]", kind: zenoh.SampleKind) -> zenoh.Sample:
+    """The next sample, which has to be of `kind`."""
+    sample = subscriber.handler.get(timeout=READY_SECONDS)
+    assert sample.kind == kind
+    return sample

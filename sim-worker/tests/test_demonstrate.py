@@ -1,0 +1,122 @@
+import subprocess
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import zenoh
+
+from cpn.v1 import demonstration_pb2, types_pb2
+from cpn_sim_worker import keys
+from cpn_sim_worker.demonstrate import DemonstrateConfig
+from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
+from cpn_sim_worker.wire import action_from_proto, decode, encoding, image_from_proto
+from tests.support import COMMAND, UNSOLVED
+
+Step = demonstration_pb2.DemonstrationStep
+
+
+class Trainer:
+    """Receives demonstrations and loses every seventh step the first time."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.steps: defaultdict[str, dict[int, Step]] = defaultdict(dict)
+        self.kept: dict[str, demonstration_pb2.CommitEpisodeRequest] = {}
+        self.received: list[tuple[str, int]] = []
+        self.refuse = False
+        self._subscriber = session.declare_subscriber(keys.demonstration_step("*", "*"), self._receive)
+        self._queryable = session.declare_queryable(keys.demonstration_commit("*"), self._commit, complete=True)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        step = decode(Step, sample.payload.to_bytes())
+        assert str(sample.key_expr) == keys.demonstration_step(step.episode_id, step.step)
+        first_time = (step.episode_id, step.step) not in self.received
+        self.received.append((step.episode_id, step.step))
+        if not (first_time and step.step % 7 == 3):
+            self.steps[step.episode_id][step.step] = step
+
+    def _commit(self, query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            request = decode(demonstration_pb2.CommitEpisodeRequest, query.payload.to_bytes())
+            if self.refuse:
+                error = types_pb2.Error(code=types_pb2.ERROR_CODE_INVALID_ARGUMENT, field="steps")
+                query.reply_err(error.SerializeToString(), encoding=encoding(types_pb2.Error))
+                return
+            missing = [step for step in range(request.steps) if step not in self.steps[request.episode_id]]
+            if not missing:
+                self.kept[request.episode_id] = request
+            response = demonstration_pb2.CommitEpisodeResponse(missing_steps=missing)
+            query.reply(keys.demonstration_commit(request.episode_id), response.SerializeToString())
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+        self._queryable.undeclare()
+
+
+@pytest.fixture
+def trainer(session: zenoh.Session) -> Iterator[Trainer]:
+    trainer = Trainer(session)
+    yield trainer
+    trainer.close()
+
+
+def demonstrate(endpoint: str, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [COMMAND, "demonstrate", "--connect", endpoint, *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
+    trainer: Trainer, endpoint: str, simulator: Simulator
+) -> None:
+    options = ("--tasks", "reach", "coffee-button", "--episodes", "2", "--first-seed", "5", "--processes", "2")
+    run = demonstrate(endpoint, *options)
+    assert run.returncode == 0, run.stderr
+    assert set(trainer.kept) == {"reach-5", "reach-6", "coffee-button-5", "coffee-button-6"}
+    assert "reach: 2 episodes of 2 tries, 0 rejected" in run.stdout
+
+    request = trainer.kept["reach-5"]
+    assert request.variation == types_pb2.Variation(task="reach", seed=5)
+    assert trainer.received.count(("reach-5", 3)) == 2
+    simulator.reset("reach", 5)
+    for number in range(request.steps):
+        step = trainer.steps["reach-5"][number]
+        assert np.array_equal(image_from_proto(step.frame, "frame"), simulator.frame())
+        assert step.HasField("action") == (number < request.steps - 1)
+        if step.HasField("action"):
+            simulator.step(action_from_proto(step.action, "action"))
+
+    trainer.received.clear()
+    assert demonstrate(endpoint, *options).returncode == 0
+    assert trainer.received == []
+
+
+def test_failed_expert_runs_are_rejected_and_counted(trainer: Trainer, endpoint: str) -> None:
+    task, seed = UNSOLVED
+    run = demonstrate(endpoint, "--tasks", task, "--episodes", "1", "--first-seed", str(seed))
+    assert run.returncode == 0, run.stderr
+    assert set(trainer.kept) == {f"{task}-{seed + 1}"}
+    assert f"{task}: 1 episodes of 2 tries, 1 rejected" in run.stdout
+
+
+def test_refusal_ends_the_run_with_its_reason(trainer: Trainer, endpoint: str) -> None:
+    trainer.refuse = True
+    run = demonstrate(endpoint, "--tasks", "reach", "--episodes", "1")
+    assert run.returncode == 1
+    assert "INVALID_ARGUMENT steps" in run.stderr
+    assert "run the same command again" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first_seed": FIRST_EVALUATION_SEED}, "first_seed: expected 0 to 999999"),
+        ({"episodes": 0}, "episodes: expected at least 1"),
+        ({"processes": 0}, "processes: expected at least 1"),
+        ({"tasks": ("juggle",)}, "unknown task 'juggle'"),
+    ],
+)
+def test_configuration_at_fault_is_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DemonstrateConfig(**options)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,216 @@
+import os
+import signal
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import zenoh
+
+from cpn.v1 import sim_pb2, types_pb2
+from cpn_sim_worker import keys
+from cpn_sim_worker.episode import EpisodeRunner, _Episode
+from cpn_sim_worker.server import QUEUE_LENGTH, ServeConfig, SimServer
+from cpn_sim_worker.session import UnavailableError, ask
+from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
+from cpn_sim_worker.wire import MAX_PAYLOAD_BYTES, RequestError, decode, encoding, image_from_proto
+from tests.support import READY_SECONDS, UNSOLVED, StartWorker, collect, wait_for_sample
+
+SEED = FIRST_EVALUATION_SEED + 1
+REST = (0.0, 0.0, 0.0, 0.0)
+
+
+class Worker:
+    """A client of one worker."""
+
+    def __init__(self, session: zenoh.Session, name: str) -> None:
+        self.session = session
+        self.name = name
+
+    def reset(self, task: str = "reach", seed: int = SEED) -> sim_pb2.ResetResponse:
+        request = sim_pb2.ResetRequest(variation=types_pb2.Variation(task=task, seed=seed))
+        return ask(self.session, keys.sim_reset(self.name), request, sim_pb2.ResetResponse, READY_SECONDS)
+
+    def step(self, episode_id: str, step: int, values: tuple[float, ...] = REST) -> sim_pb2.StepResponse:
+        request = sim_pb2.StepRequest(episode_id=episode_id, step=step, action=types_pb2.Action(values=values))
+        return ask(self.session, keys.sim_step(self.name), request, sim_pb2.StepResponse, READY_SECONDS)
+
+    def error(self, key: str, payload: bytes) -> types_pb2.Error:
+        """The error reply to raw bytes."""
+        (reply,) = self.session.get(key, payload=payload, timeout=READY_SECONDS)
+        assert reply.err is not None
+        assert str(reply.err.encoding) == encoding(types_pb2.Error)
+        return decode(types_pb2.Error, reply.err.payload.to_bytes())
+
+
+@pytest.fixture(scope="module")
+def worker(session: zenoh.Session, start_worker: StartWorker) -> Worker:
+    start_worker("w0", "--max-steps", "6")
+    return Worker(session, "w0")
+
+
+def test_episode_runs_to_its_last_step(worker: Worker) -> None:
+    start = worker.reset()
+    assert start.max_steps == 6
+    first = image_from_proto(start.observation, "observation")
+    assert not np.array_equal(first, image_from_proto(start.goal, "goal"))
+    responses = [worker.step(start.episode_id, step, (0, 0, 1, 0)) for step in range(6)]
+    assert [response.done for response in responses] == [False] * 5 + [True]
+    assert not any(response.success for response in responses)
+    assert not np.array_equal(first, image_from_proto(responses[-1].observation, "observation"))
+    with pytest.raises(RequestError, match=r"FAILED_PRECONDITION episode_id: .*one that ended after 6 steps"):
+        worker.step(start.episode_id, 6)
+
+
+def test_reset_is_reproducible_and_ends_the_episode_before(worker: Worker) -> None:
+    first, second = worker.reset(), worker.reset()
+    assert first.episode_id != second.episode_id
+    assert (first.goal, first.observation) == (second.goal, second.observation)
+    with pytest.raises(RequestError, match="NOT_FOUND episode_id") as caught:
+        worker.step(first.episode_id, 0)
+    assert second.episode_id in caught.value.expected
+    assert first.episode_id in caught.value.got
+
+
+def test_step_is_applied_exactly_once(worker: Worker) -> None:
+    up = (0.0, 0.0, 1.0, 0.0)
+    once = worker.reset().episode_id
+    expected = [worker.step(once, step, up) for step in range(3)]
+    repeated = worker.reset().episode_id
+    for step in range(3):
+        assert [worker.step(repeated, step, up) for _ in range(3)] == [expected[step]] * 3
+
+
+@pytest.mark.parametrize(("step", "values"), [(2, REST), (0, (0.5, 0, 0, 0)), (7, REST)])
+def test_step_out_of_order_is_refused(worker: Worker, step: int, values: tuple[float, ...]) -> None:
+    """A gap, another action under a number already used, and a number beyond the end."""
+    episode = worker.reset().episode_id
+    worker.step(episode, 0)
+    with pytest.raises(RequestError, match=f"FAILED_PRECONDITION step: expected 1, got {step}"):
+        worker.step(episode, step, values)
+    assert not worker.step(episode, 1).done
+
+
+@pytest.mark.parametrize("values", [(0, 0, 0), (float("nan"), 0, 0, 0), (0, 0, 0, 2)])
+def test_bad_action_is_refused_and_not_applied(worker: Worker, values: tuple[float, ...]) -> None:
+    episode = worker.reset().episode_id
+    with pytest.raises(RequestError, match=r"INVALID_ARGUMENT action\.values"):
+        worker.step(episode, 0, values)
+    worker.step(episode, 0)
+
+
+def test_refused_reset_leaves_the_episode_running(worker: Worker) -> None:
+    episode = worker.reset().episode_id
+    with pytest.raises(RequestError, match=r"INVALID_ARGUMENT variation.task: expected one of .*, got 'juggle'"):
+        worker.reset(task="juggle")
+    worker.step(episode, 0)
+
+
+def test_variation_beyond_the_expert_is_refused(worker: Worker) -> None:
+    with pytest.raises(RequestError, match=r"FAILED_PRECONDITION variation\.seed"):
+        worker.reset(*UNSOLVED)
+    worker.reset()
+
+
+@pytest.mark.parametrize("key", [keys.sim_reset, keys.sim_step])
+@pytest.mark.parametrize("payload", [b"\x0a\x7f", b"\xff" * 12, b"\0" * (MAX_PAYLOAD_BYTES + 1)])
+def test_undecodable_request_is_refused(worker: Worker, key: Callable[[str], str], payload: bytes) -> None:
+    error = worker.error(key(worker.name), payload)
+    assert (error.code, error.field) == (types_pb2.ERROR_CODE_INVALID_ARGUMENT, "payload")
+    worker.reset()
+
+
+def test_empty_request_is_refused(worker: Worker) -> None:
+    assert worker.error(keys.sim_reset(worker.name), b"").field == "variation.task"
+    assert worker.error(keys.sim_step(worker.name), b"").field == "episode_id"
+
+
+def test_full_queue_refuses_at_once(worker: Worker) -> None:
+    request = sim_pb2.ResetRequest(variation=types_pb2.Variation(task="reach", seed=SEED)).SerializeToString()
+    key = keys.sim_reset(worker.name)
+    pending = [worker.session.get(key, payload=request, timeout=READY_SECONDS) for _ in range(QUEUE_LENGTH + 4)]
+    replies = [reply for replies in pending for reply in replies]
+    assert len(replies) == len(pending)
+    codes = [decode(types_pb2.Error, reply.err.payload.to_bytes()).code for reply in replies if reply.err]
+    assert codes
+    assert set(codes) == {types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED}
+    worker.reset()
+
+
+def test_watchers_see_every_applied_step(worker: Worker) -> None:
+    frames = worker.session.declare_subscriber(keys.sim_frame("w0"), collect())
+    actions = worker.session.declare_subscriber(keys.sim_action("w0"), collect())
+    start = worker.reset()
+    steps = [worker.step(start.episode_id, step, (0, 0, 1, 0)) for step in (0, 0, 1)]
+    images = [start.observation, steps[0].observation, steps[2].observation]
+    for step, image in enumerate(images):
+        frame = decode(sim_pb2.Frame, wait_for_sample(frames, zenoh.SampleKind.PUT).payload.to_bytes())
+        assert frame == sim_pb2.Frame(episode_id=start.episode_id, step=step, image=image)
+    for step in range(2):
+        action = decode(sim_pb2.AppliedAction, wait_for_sample(actions, zenoh.SampleKind.PUT).payload.to_bytes())
+        assert (action.episode_id, action.step, list(action.action.values)) == (start.episode_id, step, [0, 0, 1, 0])
+    frames.undeclare()
+    actions.undeclare()
+
+
+def test_two_workers_never_mix_their_frames(
+    session: zenoh.Session, start_worker: StartWorker, simulator: Simulator
+) -> None:
+    tasks = {"left": "door-lock", "right": "coffee-button"}
+    for name in tasks:
+        start_worker(name)
+    workers = {name: Worker(session, name) for name in tasks}
+    starts = {name: workers[name].reset(task) for name, task in tasks.items()}
+    got = {name: [image_from_proto(start.observation, "observation")] for name, start in starts.items()}
+    for step in range(4):
+        for name, worker in workers.items():
+            response = worker.step(starts[name].episode_id, step, (1, 0, -1, 1))
+            got[name].append(image_from_proto(response.observation, "observation"))
+    for name, task in tasks.items():
+        simulator.reset(task, SEED)
+        for frame in got[name]:
+            assert np.array_equal(frame, simulator.frame())
+            simulator.step(np.array([1, 0, -1, 1], np.float32))
+
+
+def test_sigterm_ends_a_worker_and_its_token(session: zenoh.Session, start_worker: StartWorker) -> None:
+    process = start_worker("mortal")
+    gone = session.liveliness().declare_subscriber(keys.sim_alive("mortal"), collect())
+    os.kill(process.pid, signal.SIGTERM)
+    wait_for_sample(gone, zenoh.SampleKind.DELETE)
+    gone.undeclare()
+    assert process.wait(timeout=READY_SECONDS) == 0
+    with pytest.raises(UnavailableError):
+        Worker(session, "mortal").reset()
+
+
+def test_fault_in_a_request_is_answered_and_ends_the_episode(session: zenoh.Session, simulator: Simulator) -> None:
+    # An episode whose simulator never loaded a task.
+    episodes = EpisodeRunner(Simulator(simulator._renderer), max_steps=1)
+    episodes._episode = _Episode("x")
+    server = SimServer(session, "faulty", episodes)
+    alive = session.liveliness().declare_subscriber(keys.sim_alive("faulty"), collect())
+    stop = threading.Event()
+    thread = threading.Thread(target=server.run, args=(stop,))
+    thread.start()
+    try:
+        wait_for_sample(alive, zenoh.SampleKind.PUT)
+        worker = Worker(session, "faulty")
+        with pytest.raises(RequestError, match="INTERNAL"):
+            worker.step("x", 0)
+        with pytest.raises(RequestError, match="NOT_FOUND episode_id: expected an episode started by a reset"):
+            worker.step("x", 0)
+    finally:
+        stop.set()
+        thread.join()
+        alive.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"worker": "a/b"}, "worker: expected a name"), ({"max_steps": 501}, "max_steps: expected 1 to 500, got 501")],
+)
+def test_configuration_at_fault_is_refused(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ServeConfig(**options)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,117 @@
+import hashlib
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.tasks import TASKS, UnknownTaskError
+
+# Prints one digest per frame of a short walk through the tasks named on its command line.
+WALK = """
+import hashlib, sys
+import numpy as np
+from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.simulator import Simulator
+simulator = Simulator(Renderer())
+for task in sys.argv[1:]:
+    simulator.reset(task, 7)
+    for x in (1, -1, 1):
+        print(hashlib.sha256(simulator.frame().tobytes()).hexdigest())
+        simulator.step(np.array([x, 0.5, -0.5, 1], np.float32))
+"""
+
+
+def walk(simulator: Simulator, task: str) -> list[str]:
+    """The same walk in this process."""
+    digests = []
+    simulator.reset(task, 7)
+    for x in (1, -1, 1):
+        digests.append(hashlib.sha256(simulator.frame().tobytes()).hexdigest())
+        simulator.step(np.array([x, 0.5, -0.5, 1], np.float32))
+    return digests
+
+
+def start_walk(*tasks: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", WALK, *tasks], stdout=subprocess.PIPE, text=True)
+
+
+def physics(simulator: Simulator) -> NDArray[np.float64]:
+    """Positions and velocities of everything that moves."""
+    data = simulator._env.data
+    return np.concatenate([data.qpos, data.qvel, data.mocap_pos.ravel()])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_variation_depends_on_task_and_seed_alone(simulator: Simulator, task: str) -> None:
+    first_state = simulator.reset(task, 3)
+    first = physics(simulator)
+    assert not np.array_equal(simulator.reset(task, 4), first_state)
+    for _ in range(5):
+        simulator.step(np.array([1, 1, -1, 1], np.float32))
+    np.random.seed(1)  # The generator that Meta-World draws from by default.
+    assert np.array_equal(simulator.reset(task, 3), first_state)
+    assert np.array_equal(physics(simulator), first)
+
+
+def test_unknown_task_is_refused(simulator: Simulator) -> None:
+    with pytest.raises(UnknownTaskError, match="make-coffee"):
+        simulator.reset("make-coffee", 0)
+
+
+def test_frame_changes_when_the_arm_moves(simulator: Simulator) -> None:
+    simulator.reset("reach", 0)
+    frames = []
+    for _ in range(3):
+        frames.append(simulator.frame())
+        for _ in range(5):
+            simulator.step(np.array([0, 0, 1, 0], np.float32))
+    assert np.count_nonzero(frames[0] != frames[1]) > 100
+    assert np.count_nonzero(frames[1] != frames[2]) > 100
+
+
+def test_frames_equal_those_of_fresh_processes(simulator: Simulator) -> None:
+    """Also after another model was drawn, in either process, and while another process draws."""
+    tasks = ("door-lock", "reach")
+    alone = [start_walk(task) for task in tasks]
+    both = start_walk(*tasks, tasks[0])
+    outputs = [process.communicate()[0].split() for process in (*alone, both)]
+    walks = [walk(simulator, task) for task in tasks]
+    assert outputs == [walks[0], walks[1], [*walks[0], *walks[1], *walks[0]]]
+    assert len({digest for output in walks for digest in output}) == 6
+
+
+@pytest.mark.usefixtures("simulator")
+def test_a_second_renderer_is_refused() -> None:
+    with pytest.raises(RuntimeError, match="one Renderer only"):
+        Renderer()
+
+
+def test_image_is_upright_and_not_mirrored(simulator: Simulator) -> None:
+    """The camera faces -x: +y, where the table stands, is to the right of the arm's base, and the table is below."""
+    simulator.reset("reach", 0)
+    frame = simulator.frame().astype(int)
+    arm = (frame[..., 0] > 80) & (frame[..., 1] < 50)
+    table = (frame[..., 0] - frame[..., 2] > 25) & ~arm
+    rows, columns = (np.nonzero(mask) for mask in (arm, table))
+    assert rows[1].mean() < 42 < columns[1].mean()
+    assert rows[0].mean() < columns[0].mean()
+    assert columns[0].mean() > 42
+
+
+@pytest.mark.parametrize("task", ["reach", "drawer-open", "lever-pull"])
+def test_goal_site_is_hidden(simulator: Simulator, task: str) -> None:
+    simulator.reset(task, 0)
+    hidden = simulator.frame()
+    renderer, env = simulator._renderer, simulator._env
+    renderer._option.sitegroup[:] = 1
+    shown = simulator.frame()
+    renderer._option.sitegroup[:] = 0
+    assert np.count_nonzero(shown != hidden) > 0
+    env.model.site("goal").pos[2] += 0.1
+    mujoco.mj_forward(env.model, env.data)  # pyright: ignore[reportAttributeAccessIssue]
+    assert np.array_equal(simulator.frame(), hidden)

@@ -1,0 +1,156 @@
+"""An independent PyTorch implementation of CPN, which writes the golden tensors of `crates/cpn/tests/golden.rs`.
+
+Written from the paper alone, with other building blocks than the Rust code (einsum, `torch.func`, explicit weights), so
+that a shared mistake is unlikely. Run it again only when the mathematics changes:
+
+    uv run --with torch==2.13.0 --with numpy --with safetensors tests/golden/reference.py
+"""
+
+import json
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch.func import grad
+
+LATENT, HIDDEN, GATE, ACTIONS, HORIZON, BATCH = 8, 6, 5, 4, 3, 2
+CONVOLUTIONS = [(4, 8, 8), (6, 4, 2)]  # channels, kernel, stride
+
+
+def dense_shapes(prefix: str, inputs: int, outputs: int, gated: bool) -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {f"{prefix}.weight": (outputs, inputs), f"{prefix}.bias": (outputs,)}
+    if gated:
+        for gate, size in (("u", outputs * inputs), ("v", outputs)):
+            shapes |= {
+                f"{prefix}.{gate}.hidden.weight": (GATE, inputs),
+                f"{prefix}.{gate}.hidden.bias": (GATE,),
+                f"{prefix}.{gate}.output.weight": (size, GATE),
+                f"{prefix}.{gate}.output.bias": (size,),
+            }
+    return shapes
+
+
+def make_weights(method: str) -> dict[str, torch.Tensor]:
+    gated = method == "cpn"
+    shapes: dict[str, tuple[int, ...]] = {"step_size": ()}
+    channels, size = 3, 84
+    for i, (out, kernel, stride) in enumerate(CONVOLUTIONS):
+        shapes |= {f"encoder.conv.{i}.weight": (out, channels, kernel, kernel), f"encoder.conv.{i}.bias": (out,)}
+        channels, size = out, (size - kernel) // stride + 1
+    shapes |= {"encoder.linear.weight": (LATENT, channels * size * size), "encoder.linear.bias": (LATENT,)}
+    shapes |= {"encoder.norm.weight": (LATENT,), "encoder.norm.bias": (LATENT,)}
+    shapes |= dense_shapes("network.trunk", LATENT * (2 if gated else 1), HIDDEN, gated)
+    shapes |= dense_shapes("network.policy_0", HIDDEN, HIDDEN, gated)
+    shapes |= dense_shapes("network.policy_1", HIDDEN, ACTIONS, gated)
+    shapes |= dense_shapes("network.dynamics_0", HIDDEN + ACTIONS, HIDDEN, gated)
+    shapes |= dense_shapes("network.dynamics_1", HIDDEN, LATENT, gated)
+    return {name: torch.randn(shape) * 0.3 for name, shape in shapes.items()}
+
+
+def dense(w: dict[str, torch.Tensor], prefix: str, x: torch.Tensor) -> torch.Tensor:
+    """y = (u(x) * a) x + v(x) * b for one sample, or a x + b where the layer has no gates."""
+    a, b = w[f"{prefix}.weight"], w[f"{prefix}.bias"]
+    if f"{prefix}.u.hidden.weight" in w:
+
+        def gate(name: str) -> torch.Tensor:
+            layer = lambda part, y: w[f"{prefix}.{name}.{part}.weight"] @ y + w[f"{prefix}.{name}.{part}.bias"]
+            return 1 / (1 + torch.exp(-layer("output", layer("hidden", x).clamp(min=0))))
+
+        a, b = gate("u").reshape(a.shape) * a, gate("v") * b
+    return torch.einsum("oi,i->o", a, x) + b
+
+
+def encode(w: dict[str, torch.Tensor], image: torch.Tensor) -> torch.Tensor:
+    y = image.movedim(-1, 0)[None].double() / 255 - 0.5
+    for i, (_, _, stride) in enumerate(CONVOLUTIONS):
+        y = F.conv2d(y, w[f"encoder.conv.{i}.weight"], w[f"encoder.conv.{i}.bias"], stride=stride).clamp(min=0)
+    x = w["encoder.linear.weight"] @ y.reshape(-1) + w["encoder.linear.bias"]
+    centred = x - x.mean()
+    return centred / (centred.square().mean() + 1e-5).sqrt() * w["encoder.norm.weight"] + w["encoder.norm.bias"]
+
+
+def features(w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    gated = "network.trunk.u.hidden.weight" in w
+    return dense(w, "network.trunk", torch.cat([x, goal]) if gated else x).clamp(min=0)
+
+
+def policy(w: dict[str, torch.Tensor], h: torch.Tensor) -> torch.Tensor:
+    return torch.tanh(dense(w, "network.policy_1", dense(w, "network.policy_0", h).clamp(min=0)))
+
+
+def step(w: dict[str, torch.Tensor], x: torch.Tensor, h: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    hidden = dense(w, "network.dynamics_0", torch.cat([h, action])).clamp(min=0)
+    return x + dense(w, "network.dynamics_1", hidden)
+
+
+def inner_loss(actions: torch.Tensor, w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    for action in actions:
+        x = step(w, x, features(w, x, goal), action)
+    error = (x - goal).abs()
+    return torch.where(error < 1, 0.5 * error**2, error - 0.5).sum()
+
+
+def plan(w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor, updates: int):
+    actions, state = [], x
+    for _ in range(HORIZON):
+        h = features(w, state, goal)
+        actions.append(policy(w, h))
+        state = step(w, state, h, actions[-1])
+    actions = torch.stack(actions)
+    losses = [inner_loss(actions, w, x, goal)]
+    for _ in range(updates):
+        actions = actions - w["step_size"] * grad(inner_loss)(actions, w, x, goal)
+        losses.append(inner_loss(actions, w, x, goal))
+    return actions, torch.stack(losses)
+
+
+def main() -> None:
+    torch.set_default_dtype(torch.float64)
+    for method, updates in (("upn", 1), ("cpn", 2)):
+        torch.manual_seed(7)
+        weights = make_weights(method)
+        observations, goals = torch.randint(0, 256, (2, BATCH, 84, 84, 3), dtype=torch.uint8)
+        demonstrated = torch.rand(BATCH, HORIZON, ACTIONS) * 2 - 1
+        mask = torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+
+        def outer_loss(w: dict[str, torch.Tensor]) -> torch.Tensor:
+            planned = [plan(w, encode(w, o), encode(w, g), updates)[0] for o, g in zip(observations, goals)]
+            squared = (torch.stack(planned) - demonstrated).square() * mask[..., None]
+            return squared.sum() / (mask.sum() * ACTIONS)
+
+        pairs = [(encode(weights, o), encode(weights, g)) for o, g in zip(observations, goals)]
+        plans = [plan(weights, x, goal, updates) for x, goal in pairs]
+        gradients = grad(outer_loss)(weights)
+        tensors = {f"weight.{k}": v for k, v in weights.items()} | {f"gradient.{k}": v for k, v in gradients.items()}
+        tensors |= {
+            "observations": observations,
+            "goals": goals,
+            "demonstrated": demonstrated,
+            "mask": mask,
+            "x": torch.stack([x for x, _ in pairs]),
+            "x_g": torch.stack([goal for _, goal in pairs]),
+            "actions": torch.stack([actions for actions, _ in plans]),
+            "inner_losses": torch.stack([losses for _, losses in plans], dim=1),
+            "outer_loss": outer_loss(weights),
+        }
+        model = {
+            "method": method,
+            "encoder": {
+                "convolutions": [{"channels": c, "kernel": k, "stride": s} for c, k, s in CONVOLUTIONS],
+                "latent": LATENT,
+                "layer_norm": True,
+            },
+            "hidden": HIDDEN,
+            "gate_hidden": GATE,
+            "actions": ACTIONS,
+            "horizon": HORIZON,
+            "updates": updates,
+        }
+        tensors = {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}
+        path = Path(__file__).parent / f"{method}.safetensors"
+        save_file(tensors, path, metadata={"cpn": json.dumps(model)})
+
+
+if __name__ == "__main__":
+    main()
