@@ -53,7 +53,7 @@ proptest! {
         model in name(),
         goal in prop_oneof![digest().prop_map(Goal::Id), image().prop_map(Goal::Image)],
         observation in image(),
-        seed: u64,
+        seed in any::<u64>(),
         deadline in option::of((1u64..u64::from(u32::MAX)).prop_map(Duration::from_millis)),
     ) {
         survives(PlanRequest { model, goal, observation, seed, deadline });
@@ -98,10 +98,10 @@ proptest! {
         variation in variation(),
         episode_id in name(),
         (goal, observation) in (image(), image()),
-        step: u32,
+        step in any::<u32>(),
         action in action(),
         reward in -9.0..9.0,
-        (success, done): (bool, bool),
+        (success, done) in any::<(bool, bool)>(),
     ) {
         survives(ResetRequest { variation });
         survives(StepRequest { episode_id: episode_id.clone(), step, action });
