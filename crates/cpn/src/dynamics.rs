@@ -2,8 +2,8 @@
 
 use crate::config::ModelConfig;
 use crate::neuromodulated::Neuromodulated;
-use tch::nn::{self, Module};
 use tch::Tensor;
+use tch::nn::{self, Module};
 
 /// A shared trunk, a policy branch and a dynamics branch that also sees the action.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! The neuromodulated fully connected layer (section "Neuromodulated meta-learning").
 
-use tch::nn::{self, Init, Module};
 use tch::Tensor;
+use tch::nn::{self, Init, Module};
 
 /// Attenuation starts near 1 (sigmoid(2) = 0.88), so that training starts from an almost plain linear layer.
 const GATE_BIAS: f64 = 2.0;

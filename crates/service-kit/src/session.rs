@@ -4,26 +4,23 @@ use anyhow::{Context, anyhow};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-/// How a process joins the others.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
+/// How a process joins the others. What is left empty is not serialised, so that it can stand in a layer of
+/// configuration and on a command line alike.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct SessionConfig {
     /// Endpoints to connect to, for example tcp/127.0.0.1:7447.
-    #[arg(long, env = "CPN_CONNECT", value_delimiter = ',', global = true)]
+    #[arg(long, env = "CPN_CONNECT", value_delimiter = ',')]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub connect: Vec<String>,
-    /// Endpoints to listen on.
-    #[arg(long, env = "CPN_LISTEN", value_delimiter = ',', default_value = "tcp/127.0.0.1:0", global = true)]
+    /// Endpoints to listen on; any free port of the loopback interface if none is given.
+    #[arg(long, env = "CPN_LISTEN", value_delimiter = ',')]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
     /// Key prefix that keeps this run's messages apart from those of others.
-    #[arg(long, env = "CPN_NAMESPACE", global = true)]
+    #[arg(long, env = "CPN_NAMESPACE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub namespace: Option<String>,
-}
-
-impl Default for SessionConfig {
-    fn default() -> Self {
-        Self { connect: Vec::new(), listen: vec!["tcp/127.0.0.1:0".into()], namespace: None }
-    }
 }
 
 /// Opens a session in peer mode. Peers find each other by gossip from one known endpoint, never by multicast, which
@@ -42,7 +39,8 @@ pub async fn open(config: &SessionConfig) -> anyhow::Result<zenoh::Session> {
     set("connect/endpoints", json!(config.connect))?;
     set("connect/timeout_ms", json!(-1))?;
     set("connect/exit_on_failure", json!(false))?;
-    set("listen/endpoints", json!(config.listen))?;
+    let any_port = ["tcp/127.0.0.1:0".to_owned()];
+    set("listen/endpoints", json!(if config.listen.is_empty() { &any_port[..] } else { &config.listen[..] }))?;
     if let Some(namespace) = &config.namespace {
         set("namespace", json!(namespace))?;
     }

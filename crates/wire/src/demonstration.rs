@@ -39,11 +39,7 @@ pub struct CommitEpisodeResponse {
 }
 
 fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
-    if (min..=max).contains(&value) {
-        Ok(value)
-    } else {
-        Err(Error::invalid(field, format!("{min} to {max}"), value))
-    }
+    if (min..=max).contains(&value) { Ok(value) } else { Err(Error::invalid(field, format!("{min} to {max}"), value)) }
 }
 
 impl Message for DemonstrationStep {

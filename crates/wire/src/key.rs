@@ -60,3 +60,8 @@ keys! {
 pub fn worker_of_sim_alive(key: &keyexpr) -> Option<String> {
     Some(format::sim_alive::parse(key).ok()?.worker().to_string())
 }
+
+/// The digest in the key of a checkpoint's pieces.
+pub fn digest_of_checkpoint_chunk(key: &keyexpr) -> Option<String> {
+    Some(format::checkpoint_chunk::parse(key).ok()?.digest().to_string())
+}

@@ -68,12 +68,9 @@ pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
 /// If zenoh cannot send it.
 pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Result<()> {
     match result {
-        Ok(response) => {
-            query.reply(query.key_expr(), encode(response)).encoding(encoding::<R::Proto>()).wait()
+        Ok(response) => query.reply(query.key_expr(), encode(response)).encoding(encoding::<R::Proto>()).wait(),
+        Err(error) => {
+            query.reply_err(proto::Error::from(error).encode_to_vec()).encoding(encoding::<proto::Error>()).wait()
         }
-        Err(error) => query
-            .reply_err(proto::Error::from(error).encode_to_vec())
-            .encoding(encoding::<proto::Error>())
-            .wait(),
     }
 }

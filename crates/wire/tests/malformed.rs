@@ -51,18 +51,8 @@ fn each_wrong_field_is_named() {
             "PIXEL_FORMAT_RGB8",
             "PIXEL_FORMAT_UNSPECIFIED",
         ),
-        (
-            refusal(|r| r.observation.as_mut().unwrap().format = 77),
-            "observation.format",
-            "PIXEL_FORMAT_RGB8",
-            "77",
-        ),
-        (
-            refusal(|r| r.observation.as_mut().unwrap().data.truncate(9)),
-            "observation.data",
-            "21168 bytes",
-            "9 bytes",
-        ),
+        (refusal(|r| r.observation.as_mut().unwrap().format = 77), "observation.format", "PIXEL_FORMAT_RGB8", "77"),
+        (refusal(|r| r.observation.as_mut().unwrap().data.truncate(9)), "observation.data", "21168 bytes", "9 bytes"),
         (refusal(|r| r.observation.as_mut().unwrap().width = 0), "observation.width", "1 to 512 pixels", "0"),
     ];
     for (error, field, expected, got) in cases {
@@ -88,10 +78,8 @@ fn an_endless_message_is_refused_unread() {
 
 #[test]
 fn an_action_that_is_not_a_number_is_refused() {
-    let request = proto::StepRequest {
-        action: Some(proto::Action { values: vec![0.0, f32::NAN] }),
-        ..Default::default()
-    };
+    let request =
+        proto::StepRequest { action: Some(proto::Action { values: vec![0.0, f32::NAN] }), ..Default::default() };
     let error = decode::<StepRequest>(&request.encode_to_vec()).unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("action.values", "NaN"));
 }

@@ -14,8 +14,7 @@ use wire::{Image, Message, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
     (1u32..6, 1u32..6).prop_flat_map(|(height, width)| {
-        vec(any::<u8>(), (height * width * 3) as usize)
-            .prop_map(move |data| Image::new(height, width, data).unwrap())
+        vec(any::<u8>(), (height * width * 3) as usize).prop_map(move |data| Image::new(height, width, data).unwrap())
     })
 }
 

@@ -1,0 +1,217 @@
+//! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
+
+use crate::adam::Adam;
+use crate::dataset::Dataset;
+use crate::files;
+use anyhow::{Context, ensure};
+use cpn::archive::{self, Tensors};
+use cpn::checkpoint::{self, Provenance};
+use cpn::{Agent, MethodKind, ModelConfig};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use tracing::info;
+
+/// How often a run saves its state.
+const SAVE_INTERVAL: Duration = Duration::from_secs(60);
+
+/// Settings of a run; the defaults are those of the shipped checkpoints.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Folder of the demonstrations.
+    pub dataset: PathBuf,
+    /// Where the checkpoint goes.
+    pub out: PathBuf,
+    /// Method to train.
+    pub method: MethodKind,
+    /// Tasks that the model must not see.
+    pub hold_out: Vec<String>,
+    /// Passes over every frame.
+    pub epochs: u32,
+    /// Samples of a step.
+    pub batch_size: usize,
+    /// Highest learning rate of the one-cycle schedule.
+    pub peak_learning_rate: f64,
+    /// Longest gradient, as a norm over all weights.
+    pub max_gradient_norm: f64,
+    /// Seed of initialisation and sampling.
+    pub seed: u64,
+    /// Threads of libtorch; 0 leaves it to libtorch.
+    pub threads: i32,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            dataset: "data/demonstrations".into(),
+            out: "runs/checkpoints/cpn.safetensors".into(),
+            method: MethodKind::Cpn,
+            hold_out: Vec::new(),
+            epochs: 6,
+            batch_size: 128,
+            peak_learning_rate: 1.5e-3,
+            max_gradient_norm: 10.0,
+            seed: 0,
+            threads: 0,
+        }
+    }
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Outcome {
+    /// The checkpoint of this digest is written.
+    Finished {
+        /// SHA-256, in hex.
+        digest: String,
+    },
+    /// Stopped after so many steps; the same run goes on from there.
+    Interrupted {
+        /// Steps done.
+        step: u64,
+    },
+}
+
+/// What a saved state belongs to.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ResumePoint {
+    config: Config,
+    data_digest: String,
+    step: u64,
+}
+
+/// Trains until the checkpoint is written or `stop` is set, from a saved state if there is one.
+///
+/// # Errors
+/// If the demonstrations cannot be read, the saved state belongs to another run, the loss is no longer finite, or a file
+/// cannot be written.
+pub fn run(config: &Config, stop: &AtomicBool) -> anyhow::Result<Outcome> {
+    ensure!(config.batch_size > 0 && config.epochs > 0, "batch_size and epochs: expected at least 1, got 0");
+    if config.threads > 0 {
+        tch::set_num_threads(config.threads);
+    }
+    let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
+    let tasks: Vec<String> = dataset.tasks().map(str::to_owned).collect();
+    info!(tasks = tasks.len(), episodes = dataset.episode_count(), samples = dataset.sample_count(), "demonstrations");
+
+    let model = ModelConfig { actions: dataset.action_size(), ..ModelConfig::paper(config.method) };
+    let agent = Agent::new(model, config.seed);
+    let mut adam = Adam::new(agent.variables());
+    let resume_path = config.out.with_extension("resume");
+    let mut step = resume(&resume_path, config, &dataset, &mut adam)?;
+
+    let per_epoch = dataset.sample_count().div_ceil(config.batch_size) as u64;
+    let total = per_epoch * u64::from(config.epochs);
+    let progress = Progress::new(config, total, step);
+    let mut saved = Instant::now();
+    while step < total {
+        let epoch = step / per_epoch;
+        let samples = dataset.shuffled(config.seed, epoch);
+        for samples in samples.chunks(config.batch_size).skip((step % per_epoch) as usize) {
+            if stop.load(Ordering::Relaxed) {
+                save(&resume_path, config, &dataset, &adam, step)?;
+                return Ok(Outcome::Interrupted { step });
+            }
+            let batch = dataset.batch(samples, agent.config().horizon);
+            let loss = agent.outer_loss(&batch.observations, &batch.goals, &batch.actions, &batch.mask);
+            let value = loss.double_value(&[]);
+            ensure!(value.is_finite(), "loss: expected a finite number, got {value} at step {step}");
+            loss.backward();
+            adam.step(one_cycle(step, total, config.peak_learning_rate), config.max_gradient_norm);
+            step += 1;
+            progress.step(step, value, samples.len());
+            if saved.elapsed() > SAVE_INTERVAL {
+                save(&resume_path, config, &dataset, &adam, step)?;
+                saved = Instant::now();
+            }
+        }
+        progress.epoch(epoch + 1);
+    }
+
+    let provenance = Provenance {
+        training_tasks: tasks,
+        data_digest: dataset.digest().to_owned(),
+        seed: config.seed,
+        epochs: config.epochs,
+    };
+    let bytes = checkpoint::to_bytes(&agent, &provenance)?;
+    files::write_atomically(&config.out, &bytes)?;
+    if resume_path.exists() {
+        std::fs::remove_file(&resume_path)?;
+    }
+    Ok(Outcome::Finished { digest: checkpoint::digest(&bytes) })
+}
+
+/// The learning rate of a step: up over the first 30 % of the run, then down, both along a cosine (Smith, 2018).
+fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
+    const WARM_UP: f64 = 0.3;
+    let done = step as f64 / total as f64;
+    let (low, progress) =
+        if done < WARM_UP { (peak / 25.0, 1.0 - done / WARM_UP) } else { (0.0, (done - WARM_UP) / (1.0 - WARM_UP)) };
+    low + (peak - low) * 0.5 * (1.0 + (PI * progress).cos())
+}
+
+fn save(path: &Path, config: &Config, dataset: &Dataset, adam: &Adam, step: u64) -> anyhow::Result<()> {
+    let point = ResumePoint { config: config.clone(), data_digest: dataset.digest().to_owned(), step };
+    files::write_atomically(path, &archive::to_bytes(&adam.state(), &point)?)
+}
+
+/// Takes up a saved state; answers the number of steps done.
+fn resume(path: &Path, config: &Config, dataset: &Dataset, adam: &mut Adam) -> anyhow::Result<u64> {
+    if !path.exists() {
+        return Ok(0);
+    }
+    let mut take_up = || {
+        let (state, point): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(path)?)?;
+        let expected = ResumePoint { config: config.clone(), data_digest: dataset.digest().to_owned(), ..point };
+        let same_run = expected.config == point.config && expected.data_digest == point.data_digest;
+        ensure!(same_run, "expected the state of this run, {expected:?}, got that of another, {point:?}");
+        adam.restore(&state, i32::try_from(point.step)?)?;
+        info!(step = point.step, "resumed");
+        Ok(point.step)
+    };
+    take_up().with_context(|| format!("resuming from {} (remove it to start anew)", path.display()))
+}
+
+/// A bar on a terminal, a line for each epoch in the log.
+struct Progress {
+    bar: ProgressBar,
+    /// A running mean of the loss.
+    loss: std::cell::Cell<f64>,
+    samples: std::cell::Cell<u64>,
+    started: Instant,
+}
+
+impl Progress {
+    fn new(config: &Config, total: u64, step: u64) -> Self {
+        let style = "{prefix:>5} {wide_bar} {pos}/{len} steps, {msg}, {eta} left";
+        let bar = ProgressBar::new(total)
+            .with_style(ProgressStyle::with_template(style).expect("a valid template"))
+            .with_prefix(config.method.name())
+            .with_position(step);
+        bar.reset_eta();
+        Self { bar, loss: f64::NAN.into(), samples: 0.into(), started: Instant::now() }
+    }
+
+    fn step(&self, step: u64, loss: f64, samples: usize) {
+        let mean = self.loss.get();
+        self.loss.set(if mean.is_nan() { loss } else { 0.98 * mean + 0.02 * loss });
+        self.samples.set(self.samples.get() + samples as u64);
+        self.bar.set_position(step);
+        self.bar.set_message(format!("loss {:.4}, {:.0} samples/s", self.loss.get(), self.samples_per_second()));
+    }
+
+    fn epoch(&self, epoch: u64) {
+        let (loss, rate) = (format!("{:.4}", self.loss.get()), format!("{:.0}", self.samples_per_second()));
+        self.bar.suspend(|| info!(epoch, loss, samples_per_second = rate, "epoch done"));
+    }
+
+    fn samples_per_second(&self) -> f64 {
+        self.samples.get() as f64 / self.started.elapsed().as_secs_f64()
+    }
+}
