@@ -110,7 +110,7 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
 async fn train(config: train::Config) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&stop);
-    let mut run = tokio::task::spawn_blocking(move || train::run(&config, &seen));
+    let mut run = tokio::task::spawn_blocking(move || train::run(&config, &|_| seen.load(Ordering::Relaxed)));
     let outcome = tokio::select! {
         outcome = &mut run => outcome??,
         signal = shutdown::requested() => {

@@ -11,7 +11,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tracing::info;
 
@@ -85,12 +84,13 @@ struct ResumePoint {
     step: u64,
 }
 
-/// Trains until the checkpoint is written or `stop` is set, from a saved state if there is one.
+/// Trains until the checkpoint is written or `stop`, asked before each step with the number of steps done, says so; from
+/// a saved state if there is one.
 ///
 /// # Errors
 /// If the demonstrations cannot be read, the saved state belongs to another run, the loss is no longer finite, or a file
 /// cannot be written.
-pub fn run(config: &Config, stop: &AtomicBool) -> anyhow::Result<Outcome> {
+pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcome> {
     ensure!(config.batch_size > 0 && config.epochs > 0, "batch_size and epochs: expected at least 1, got 0");
     if config.threads > 0 {
         tch::set_num_threads(config.threads);
@@ -113,7 +113,7 @@ pub fn run(config: &Config, stop: &AtomicBool) -> anyhow::Result<Outcome> {
         let epoch = step / per_epoch;
         let samples = dataset.shuffled(config.seed, epoch);
         for samples in samples.chunks(config.batch_size).skip((step % per_epoch) as usize) {
-            if stop.load(Ordering::Relaxed) {
+            if stop(step) {
                 save(&resume_path, config, &dataset, &adam, step)?;
                 return Ok(Outcome::Interrupted { step });
             }

@@ -1,0 +1,52 @@
+# One verb list. Every verb does its own set-up.
+
+SHELL := bash
+UV_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn
+UV := $(UV_CACHE)/tools/bin/uv
+WORKER := sim-worker/.venv
+export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
+
+.DEFAULT_GOAL := help
+.PHONY: help setup build demo models test lint format clean
+
+help: ## Show the verbs
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: .libtorch/build-version $(WORKER)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
+
+.libtorch/build-version: scripts/setup-libtorch.sh
+	scripts/setup-libtorch.sh
+
+$(UV):
+	python3 -m venv $(UV_CACHE)/tools
+	$(UV_CACHE)/tools/bin/pip install --quiet --disable-pip-version-check uv
+
+$(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/scripts/generate_proto.py $(wildcard proto/cpn/v1/*.proto) | $(UV)
+	scripts/setup-graphics.sh
+	cd sim-worker && $(UV) sync --quiet --locked && $(UV) run --quiet scripts/generate_proto.py
+	touch $@
+
+build: setup ## Compile the services
+	cargo build --release --locked
+
+demo: build ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
+	scripts/demo.sh
+
+models: build ## Make the shipped checkpoints again: demonstrations, then training (about an hour on two cores)
+	scripts/models.sh
+
+test: setup ## Everything that must pass
+	cargo test --workspace --locked
+	cd sim-worker && $(UV) run --quiet pytest
+
+lint: setup ## Formatting, lints, types
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --locked -- -D warnings
+	cd sim-worker && $(UV) run --quiet ruff check && $(UV) run --quiet ruff format --check && $(UV) run --quiet basedpyright
+
+format: setup ## Lay out all code
+	cargo fmt --all
+	cd sim-worker && $(UV) run --quiet ruff format
+
+clean: ## Remove what was built
+	rm -rf target $(WORKER) .libtorch

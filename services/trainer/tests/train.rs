@@ -1,0 +1,109 @@
+//! Training runs on a few small episodes.
+
+mod common;
+
+use common::{commit, keep};
+use cpn::MethodKind;
+use cpn::checkpoint;
+use std::path::Path;
+use trainer::train::{self, Config, Outcome};
+
+fn config(folder: &Path, name: &str) -> Config {
+    let dataset = folder.join("data");
+    if !dataset.exists() {
+        for (task, seed, steps) in [("reach", 1, 9), ("reach", 2, 7), ("door-lock", 1, 8)] {
+            keep(&dataset, &commit(task, seed, steps));
+        }
+    }
+    let out = folder.join(format!("{name}.safetensors"));
+    Config { dataset, out, epochs: 2, batch_size: 6, seed: 4, threads: 1, ..Config::default() }
+}
+
+fn finished(config: &Config) -> String {
+    match train::run(config, &|_| false).unwrap() {
+        Outcome::Finished { digest } => digest,
+        Outcome::Interrupted { step } => panic!("interrupted at {step}"),
+    }
+}
+
+#[test]
+fn an_interrupted_run_ends_with_the_same_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = finished(&config(folder.path(), "whole"));
+    let broken = config(folder.path(), "broken");
+    for stop_at in [0, 2, 5] {
+        assert_eq!(train::run(&broken, &|step| step == stop_at).unwrap(), Outcome::Interrupted { step: stop_at });
+        assert!(!broken.out.exists(), "no checkpoint before the end");
+    }
+    assert_eq!(finished(&broken), whole);
+    assert!(!broken.out.with_extension("resume").exists());
+}
+
+#[test]
+fn a_state_of_another_run_is_not_taken_up() {
+    let folder = tempfile::tempdir().unwrap();
+    let first = config(folder.path(), "same");
+    train::run(&first, &|step| step == 1).unwrap();
+    let error = train::run(&Config { seed: 5, ..first }, &|_| false).unwrap_err();
+    assert!(format!("{error:#}").contains("expected the state of this run"), "{error:#}");
+}
+
+#[test]
+fn the_checkpoint_tells_where_it_comes_from() {
+    let folder = tempfile::tempdir().unwrap();
+    for method in MethodKind::ALL {
+        let config = Config {
+            method,
+            epochs: 1,
+            hold_out: vec!["door-lock".into()],
+            ..config(folder.path(), method.name())
+        };
+        let digest = finished(&config);
+        let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
+        assert_eq!(loaded.digest, digest);
+        assert_eq!(loaded.agent.config().method, method);
+        assert_eq!(loaded.provenance.training_tasks, ["reach"]);
+        assert_eq!((loaded.provenance.seed, loaded.provenance.epochs), (4, 1));
+        assert_eq!(loaded.provenance.data_digest.len(), 64);
+    }
+}
+
+/// Noise can be learnt by heart: the loss must fall far below that of a policy that knows nothing.
+#[test]
+fn training_lowers_the_loss() {
+    let folder = tempfile::tempdir().unwrap();
+    let base = config(folder.path(), "short");
+    let loss_of = |path: &Path| {
+        let agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        let dataset = trainer::dataset::Dataset::load(&base.dataset, &[]).unwrap();
+        let batch = dataset.batch(&dataset.shuffled(0, 0), agent.config().horizon);
+        agent.outer_loss(&batch.observations, &batch.goals, &batch.actions, &batch.mask).double_value(&[])
+    };
+    finished(&Config { epochs: 1, batch_size: 50, ..base.clone() });
+    let before = loss_of(&base.out);
+    let long = Config { epochs: 40, out: folder.path().join("long.safetensors"), ..base.clone() };
+    finished(&long);
+    let after = loss_of(&long.out);
+    assert!(after < 0.5 * before, "{before} before, {after} after");
+}
+
+#[test]
+fn bad_input_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = config(folder.path(), "x");
+    let refused = |config: &Config| format!("{:#}", train::run(config, &|_| false).unwrap_err());
+
+    let message = refused(&Config { hold_out: vec!["door-lokc".into()], ..good.clone() });
+    assert!(message.contains("hold_out: expected some of [\"door-lock\", \"reach\"], got \"door-lokc\""), "{message}");
+    let message = refused(&Config { dataset: folder.path().join("nowhere"), ..good.clone() });
+    assert!(message.contains("nowhere"), "{message}");
+    let message = refused(&Config { batch_size: 0, ..good.clone() });
+    assert!(message.contains("batch_size"), "{message}");
+
+    let episode = good.dataset.join("reach/reach-1.safetensors");
+    let bytes = std::fs::read(&episode).unwrap();
+    std::fs::write(&episode, &bytes[..bytes.len() / 2]).unwrap();
+    let message = refused(&good);
+    assert!(message.contains("reach-1.safetensors") && message.contains("safetensors:"), "{message}");
+    assert!(!good.out.exists());
+}
