@@ -74,7 +74,8 @@ fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
     let base = config(folder.path(), "short");
     let loss_of = |path: &Path| {
-        let agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        let mut agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        agent.variables_mut().unfreeze();
         let dataset = trainer::dataset::Dataset::load(&base.dataset, &[]).unwrap();
         let batch = dataset.batch(&dataset.shuffled(0, 0), agent.config().horizon);
         agent.outer_loss(&batch.observations, &batch.goals, &batch.actions, &batch.mask).double_value(&[])
