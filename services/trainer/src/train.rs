@@ -50,7 +50,7 @@ impl Default for Config {
             out: "runs/checkpoints/cpn.safetensors".into(),
             method: MethodKind::Cpn,
             hold_out: Vec::new(),
-            epochs: 6,
+            epochs: 5,
             batch_size: 128,
             peak_learning_rate: 1.5e-3,
             max_gradient_norm: 10.0,
