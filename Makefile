@@ -23,7 +23,7 @@ $(UV):
 
 $(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/scripts/generate_proto.py $(wildcard proto/cpn/v1/*.proto) | $(UV)
 	scripts/setup-graphics.sh
-	cd sim-worker && $(UV) sync --quiet --locked && $(UV) run --quiet scripts/generate_proto.py
+	cd sim-worker && $(UV) sync --quiet --locked --extra grpc && $(UV) run --quiet scripts/generate_proto.py
 	touch $@
 
 build: setup ## Compile the services
@@ -42,7 +42,8 @@ test: setup ## Everything that must pass
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check && $(UV) run --quiet ruff format --check && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples && $(UV) run --quiet ruff format --check . ../examples && $(UV) run --quiet basedpyright
+	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all

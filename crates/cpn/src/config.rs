@@ -143,7 +143,8 @@ impl ModelConfig {
         Self { method, encoder: EncoderConfig::paper(), hidden: 32, gate_hidden: 32, actions: 4, horizon, updates }
     }
 
-    /// Checks every value against its range, so that a model can be built from a stranger's file.
+    /// Checks every value against its range, so that a model can be built from a stranger's file: no valid model has more
+    /// than a few hundred megabytes of weights.
     ///
     /// # Errors
     /// Names the first field out of its range, what was expected and what came.
@@ -153,14 +154,14 @@ impl ModelConfig {
         };
         in_range("encoder.convolutions", self.encoder.convolutions.len() as i64, 1, 8)?;
         for conv in &self.encoder.convolutions {
-            in_range("encoder.convolutions.channels", conv.channels, 1, 512)?;
-            in_range("encoder.convolutions.kernel", conv.kernel, 1, 16)?;
+            in_range("encoder.convolutions.channels", conv.channels, 1, 128)?;
+            in_range("encoder.convolutions.kernel", conv.kernel, 1, 8)?;
             in_range("encoder.convolutions.stride", conv.stride, 1, 16)?;
         }
-        in_range("encoder output size in pixels", self.encoder.output_size().unwrap_or(0), 1, 32)?;
-        in_range("encoder.latent", self.encoder.latent, 1, 1024)?;
-        in_range("hidden", self.hidden, 1, 1024)?;
-        in_range("gate_hidden", self.gate_hidden, 1, 256)?;
+        in_range("encoder output size in pixels", self.encoder.output_size().unwrap_or(0), 1, 16)?;
+        in_range("encoder.latent", self.encoder.latent, 1, 512)?;
+        in_range("hidden", self.hidden, 1, 256)?;
+        in_range("gate_hidden", self.gate_hidden, 1, 64)?;
         in_range("actions", self.actions, 1, 32)?;
         if self.method.plans() {
             in_range("horizon", self.horizon, 1, 64)?;

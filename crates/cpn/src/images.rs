@@ -14,7 +14,7 @@ pub const BYTES: usize = (SIZE * SIZE * CHANNELS) as usize;
 /// # Errors
 /// If the bytes are not a whole, non-zero number of images.
 pub fn from_bytes(data: &[u8]) -> Result<Tensor, ImageError> {
-    if data.is_empty() || data.len() % BYTES != 0 {
+    if data.is_empty() || !data.len().is_multiple_of(BYTES) {
         return Err(ImageError { got: data.len() });
     }
     let shape = [(data.len() / BYTES) as i64, SIZE, SIZE, CHANNELS];

@@ -55,7 +55,8 @@ impl InnerLoop<'_> {
         for _ in 0..self.updates {
             let (loss, gradient) = self.loss_and_gradient(x, x_g, &actions, true);
             inner_losses.push(loss.detach());
-            actions = actions - self.step_size * gradient;
+            // Not `-=`, which would overwrite what the graph still needs.
+            actions = &actions - self.step_size * gradient;
         }
         Plan { actions, inner_losses }
     }

@@ -96,9 +96,9 @@ fn a_weight_that_is_not_a_number_is_named() {
 #[test]
 fn a_configuration_out_of_range_builds_nothing() {
     let message = refusal(|_, metadata| metadata["model"]["encoder"]["latent"] = json!(1_000_000_000));
-    assert_eq!(message, "checkpoint model: encoder.latent: expected 1 to 1024, got 1000000000");
+    assert_eq!(message, "checkpoint model: encoder.latent: expected 1 to 512, got 1000000000");
     let message = refusal(|_, metadata| metadata["model"]["encoder"]["convolutions"][0]["kernel"] = json!(0));
-    assert_eq!(message, "checkpoint model: encoder.convolutions.kernel: expected 1 to 16, got 0");
+    assert_eq!(message, "checkpoint model: encoder.convolutions.kernel: expected 1 to 8, got 0");
     let message = refusal(|_, metadata| metadata["model"]["depth"] = json!(3));
     assert!(message.contains("unknown field `depth`"), "{message}");
 }

@@ -3,6 +3,10 @@
 use crate::proto;
 use prost::Message as _;
 
+/// Longest `expected` and `got`, in bytes: a stranger's text may be in them, and they travel in gRPC headers, where a long
+/// one would end the whole connection.
+const MAX_TEXT_BYTES: usize = 500;
+
 /// What kind of fault it is; each is the gRPC status of the same name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Code {
@@ -37,9 +41,16 @@ pub struct Error {
 }
 
 impl Error {
-    /// An error of the given kind about a field.
+    /// An error of the given kind about a field; what is too long is cut.
     pub fn new(code: Code, field: impl Into<String>, expected: impl ToString, got: impl ToString) -> Self {
-        Self { code, field: field.into(), expected: expected.to_string(), got: got.to_string() }
+        let cut = |mut text: String| {
+            if text.len() > MAX_TEXT_BYTES {
+                text.truncate(text.floor_char_boundary(MAX_TEXT_BYTES));
+                text.push('…');
+            }
+            text
+        };
+        Self { code, field: field.into(), expected: cut(expected.to_string()), got: cut(got.to_string()) }
     }
 
     /// A request that is wrong in a field.

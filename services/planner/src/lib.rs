@@ -1,1 +1,78 @@
-//! x
+//! Serves plans from trained weights over zenoh and gRPC.
+//!
+//! [`core`] is the service; `grpc` and `zenoh` translate to it and nothing more. One thread (`model_thread`) owns every
+//! model ([`model`]); goals are kept beside it (`goals`). A model is replaced between two plans and only by one that has
+//! planned once already.
+
+pub mod config;
+pub mod core;
+mod goals;
+mod grpc;
+pub mod model;
+mod model_thread;
+mod zenoh;
+
+use crate::core::PlannerCore;
+use crate::grpc::GrpcServer;
+use crate::zenoh::ZenohServer;
+pub use config::Config;
+use std::net::SocketAddr;
+use std::time::Duration;
+use tracing::{info, warn};
+
+/// How long requests in flight may take to finish at shutdown.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// A planner that runs.
+#[derive(Debug)]
+pub struct Planner {
+    core: PlannerCore,
+    grpc: GrpcServer,
+    zenoh: ZenohServer,
+}
+
+/// Loads the models and serves them; when this returns, everything answers.
+///
+/// Wants tokio's multi-threaded runtime: zenoh panics on the other.
+///
+/// # Errors
+/// If a checkpoint is faulty, an address cannot be listened on, or the name cannot stand in a key.
+pub async fn start(config: Config) -> anyhow::Result<Planner> {
+    let core = PlannerCore::start(&config).await?;
+    let grpc = GrpcServer::start(core.clone(), config.grpc_listen).await?;
+    let zenoh = ZenohServer::start(core.clone(), &config).await?;
+    grpc.ready().await;
+    info!(name = config.name, grpc = %grpc.address, "planner is ready");
+    Ok(Planner { core, grpc, zenoh })
+}
+
+impl Planner {
+    /// Where gRPC listens.
+    pub fn grpc_address(&self) -> SocketAddr {
+        self.grpc.address
+    }
+
+    /// The planner without a transport.
+    pub fn core(&self) -> PlannerCore {
+        self.core.clone()
+    }
+
+    /// Takes no more requests, lets those in flight finish within ten seconds, and leaves the network.
+    ///
+    /// # Errors
+    /// If gRPC had failed before, or zenoh does not close.
+    pub async fn shutdown(self) -> anyhow::Result<()> {
+        let Self { core, mut grpc, mut zenoh } = self;
+        let drained = tokio::time::timeout(DRAIN_TIMEOUT, async {
+            let ((), grpc) = tokio::join!(zenoh.drain(), grpc.drain());
+            core.stop().await;
+            grpc
+        })
+        .await;
+        zenoh.close().await?;
+        drained.unwrap_or_else(|_| {
+            warn!("requests in flight were given up after {} s", DRAIN_TIMEOUT.as_secs());
+            Ok(())
+        })
+    }
+}

@@ -1,2 +1,15 @@
-//! x
-fn main() {}
+//! The planner's process.
+
+use clap::Parser;
+use planner::config::{Args, Config};
+use service_kit::{config, shutdown, telemetry};
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let args = Args::parse();
+    telemetry::init();
+    let config: Config = config::load("CPN_PLANNER_", args.config.as_deref(), &args)?;
+    let planner = planner::start(config).await?;
+    shutdown::requested().await?;
+    planner.shutdown().await
+}

@@ -1,0 +1,84 @@
+//! What the planner can be told: what was typed, and what came of it.
+
+use serde::{Deserialize, Serialize};
+use service_kit::SessionConfig;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::num::NonZeroU16;
+use std::path::PathBuf;
+
+/// Valid settings of a planner.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Names the planner in its zenoh keys.
+    pub name: String,
+    /// Folder of the checkpoints: each `*.safetensors` is served under its file stem from the start.
+    pub models_dir: PathBuf,
+    /// Where gRPC listens; port 0 takes a free one.
+    pub grpc_listen: SocketAddr,
+    /// Most plan requests that wait for the model; one more is refused.
+    pub queue_capacity: NonZeroU16,
+    /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
+    pub goal_capacity: NonZeroU16,
+    /// Threads libtorch uses for one plan.
+    pub threads: NonZeroU16,
+    /// How the planner joins the others over zenoh.
+    pub session: SessionConfig,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        const fn count(value: u16) -> NonZeroU16 {
+            NonZeroU16::new(value).expect("not zero")
+        }
+        Self {
+            name: "planner".into(),
+            models_dir: "models".into(),
+            grpc_listen: (Ipv4Addr::LOCALHOST, 50051).into(),
+            queue_capacity: count(64),
+            goal_capacity: count(1024),
+            threads: count(1),
+            session: SessionConfig::default(),
+        }
+    }
+}
+
+/// Serves plans from trained weights over zenoh and gRPC.
+///
+/// Each option is also read from the environment (CPN_PLANNER_QUEUE_CAPACITY) and from the file; the command line wins
+/// over the environment, the environment over the file.
+#[derive(Debug, clap::Parser, Serialize)]
+#[command(version)]
+pub struct Args {
+    /// TOML file with settings.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub config: Option<PathBuf>,
+    /// Name of the planner in its zenoh keys [default: planner].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Folder of the checkpoints [default: models].
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub models_dir: Option<PathBuf>,
+    /// Where gRPC listens [default: 127.0.0.1:50051].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub grpc_listen: Option<SocketAddr>,
+    /// Most plan requests that wait for the model [default: 64].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub queue_capacity: Option<NonZeroU16>,
+    /// Most goal images that are kept [default: 1024].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub goal_capacity: Option<NonZeroU16>,
+    /// Threads libtorch uses for one plan [default: 1].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threads: Option<NonZeroU16>,
+    /// How to join the others.
+    #[command(flatten)]
+    pub session: SessionConfig,
+}

@@ -1,0 +1,174 @@
+//! The planner without its transports: valid requests in, answers out.
+
+use crate::config::Config;
+use crate::goals::Goals;
+use crate::model::{Model, RANDOM};
+use crate::model_thread::{ModelThread, PlanTask, unknown_model};
+use anyhow::Context;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+use tracing::{info, warn};
+use wire::planner::{
+    CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
+    PlanResponse, RegisterGoalRequest, RegisterGoalResponse,
+};
+use wire::{Code, Error, Image};
+
+/// Checkpoints that are read at the same time at most: each may take as much memory as the largest model.
+const MAX_LOADS: usize = 4;
+/// How the names of checkpoint files end.
+const EXTENSION: &str = "safetensors";
+
+/// The planner, as its transports and programs that embed it call it. Clones are the same planner.
+#[derive(Debug, Clone)]
+pub struct PlannerCore {
+    thread: ModelThread,
+    goals: Arc<Goals>,
+    loads: Arc<Semaphore>,
+    models_dir: Arc<Path>,
+}
+
+impl PlannerCore {
+    /// Loads every checkpoint of the model folder and starts to serve them.
+    ///
+    /// # Errors
+    /// Names the first checkpoint that cannot be loaded, and why.
+    pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
+        let folder = config.models_dir.clone();
+        let models = tokio::task::spawn_blocking(move || load_all(&folder)).await??;
+        for Model { info, .. } in &models {
+            info!(model = info.name, method = info.method, digest = info.digest, "serving");
+        }
+        Ok(Self {
+            thread: ModelThread::start(config, models).context("starting the model thread")?,
+            goals: Arc::new(Goals::new(config.goal_capacity)),
+            loads: Arc::new(Semaphore::new(MAX_LOADS)),
+            models_dir: config.models_dir.clone().into(),
+        })
+    }
+
+    /// The next actions towards the goal, by the named model. A goal image is registered on the way.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for an image that is not 84 x 84; `NOT_FOUND` for an unknown model or goal id;
+    /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
+    /// that is not finite; `UNAVAILABLE` during shutdown.
+    pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
+        let PlanRequest { model, goal, observation, seed, deadline } = request;
+        check_size("observation", &observation)?;
+        if !self.thread.models().contains_key(&model) {
+            return Err(unknown_model(&model, self.thread.models().keys()));
+        }
+        let (goal_id, goal) = match goal {
+            Goal::Id(id) => {
+                let image = self.goals.get(&id)?;
+                (id, image)
+            }
+            Goal::Image(image) => {
+                check_size("goal_image", &image)?;
+                self.goals.register(image)
+            }
+        };
+        self.thread.plan(PlanTask { model, goal_id, goal, observation, seed, deadline }).await
+    }
+
+    /// Keeps a goal image; the same image gets the same id.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for an image that is not 84 x 84.
+    pub fn register_goal(&self, request: RegisterGoalRequest) -> Result<RegisterGoalResponse, Error> {
+        check_size("image", &request.image)?;
+        let (goal_id, _) = self.goals.register(request.image);
+        Ok(RegisterGoalResponse { goal_id })
+    }
+
+    /// Loads a checkpoint, tries it, and swaps it in between two plans. Until then, and after any fault, the model that
+    /// had the name before serves on.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for a faulty checkpoint, with the reason; `NOT_FOUND` for a file that is not in the model
+    /// folder; `FAILED_PRECONDITION` for the name `random`; `RESOURCE_EXHAUSTED` if others are being loaded.
+    pub async fn load_model(&self, request: LoadModelRequest) -> Result<LoadModelResponse, Error> {
+        check_replaceable(&request.model)?;
+        let _load = self.loads.try_acquire().map_err(|_| {
+            Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
+        })?;
+        let folder = Arc::clone(&self.models_dir);
+        let loading = tokio::task::spawn_blocking(move || Model::load(&folder, request));
+        let model = loading.await.map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))??;
+        Ok(LoadModelResponse { model: self.serve(model).await? })
+    }
+
+    /// Serves a method that is built already, in place of the one of its name, from the next plan on.
+    ///
+    /// # Errors
+    /// `FAILED_PRECONDITION` for the name `random`; `UNAVAILABLE` during shutdown.
+    pub async fn serve(&self, model: Model) -> Result<ModelInfo, Error> {
+        check_replaceable(&model.info.name)?;
+        let info = model.info.clone();
+        self.thread.serve(model).await?;
+        info!(model = info.name, method = info.method, digest = info.digest, "serving");
+        Ok(info)
+    }
+
+    /// The models being served.
+    pub fn list_models(&self) -> ListModelsResponse {
+        ListModelsResponse { models: self.thread.models().values().cloned().collect() }
+    }
+
+    /// Finishes the plans that are waiting; refuses every later request.
+    pub(crate) async fn stop(&self) {
+        self.thread.stop().await;
+    }
+}
+
+/// `random` and every checkpoint in `folder`.
+fn load_all(folder: &Path) -> anyhow::Result<Vec<Model>> {
+    let mut models = vec![Model::random()];
+    for path in checkpoints(folder).with_context(|| format!("model folder {}", folder.display()))? {
+        models.push(load_file(folder, &path).with_context(|| format!("checkpoint {}", path.display()))?);
+    }
+    if models.len() == 1 {
+        warn!(folder = %folder.display(), "no checkpoints: only the random model is served");
+    }
+    Ok(models)
+}
+
+/// The checkpoint files of a folder, ordered by name; none if there is no folder.
+fn checkpoints(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let entries = match folder.read_dir() {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries?,
+    };
+    let paths = entries.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
+    let mut paths: Vec<_> = paths.into_iter().filter(|path| path.extension().is_some_and(|e| e == EXTENSION)).collect();
+    paths.sort();
+    Ok(paths)
+}
+
+fn load_file(folder: &Path, path: &Path) -> Result<Model, Error> {
+    let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
+    let source = CheckpointSource::File(text(path.file_name()));
+    let request = LoadModelRequest { model: text(path.file_stem()), source };
+    // A file's name is as free as a stranger's message: the trip through the wire applies the same rules to it.
+    let request: LoadModelRequest = wire::decode(&wire::encode(request))?;
+    check_replaceable(&request.model)?;
+    Model::load(folder, request)
+}
+
+fn check_replaceable(name: &str) -> Result<(), Error> {
+    if name == RANDOM {
+        return Err(Error::new(Code::FailedPrecondition, "model", format!("a name other than {RANDOM}"), name));
+    }
+    Ok(())
+}
+
+fn check_size(field: &str, image: &Image) -> Result<(), Error> {
+    for (side, got) in [("height", image.height()), ("width", image.width())] {
+        if i64::from(got) != cpn::images::SIZE {
+            return Err(Error::invalid(side, cpn::images::SIZE, got).within(field));
+        }
+    }
+    Ok(())
+}

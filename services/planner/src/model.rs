@@ -1,0 +1,127 @@
+//! A model as it is served, and what is checked before it is.
+
+use cpn::{Method, Random, checkpoint};
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+use tch::{Kind, Tensor};
+use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo};
+use wire::{Code, Error, Image};
+
+/// Name of the control of every comparison, always served.
+pub const RANDOM: &str = "random";
+/// A of the control: hand displacement x, y, z and gripper effort.
+const RANDOM_ACTIONS: i64 = 4;
+
+/// A method with the name and digest it is served under.
+pub struct Model {
+    /// What clients are told of it.
+    pub info: ModelInfo,
+    /// What plans.
+    pub method: Box<dyn Method>,
+}
+
+/// The numbers of one plan, all finite.
+#[derive(Debug)]
+pub(crate) struct Planned {
+    /// `[H][A]`, not clipped.
+    pub(crate) actions: Vec<Vec<f32>>,
+    /// One before each update and one after the last.
+    pub(crate) inner_losses: Vec<f32>,
+    /// Euclidean; none if Z is 0.
+    pub(crate) latent_distance: Option<f32>,
+}
+
+impl Model {
+    /// Uniform actions, whatever the images show.
+    pub(crate) fn random() -> Self {
+        let method = Random { actions: RANDOM_ACTIONS };
+        let digest = checkpoint::digest(RANDOM.as_bytes());
+        Self { info: info(RANDOM.to_owned(), &method, digest, Vec::new()), method: Box::new(method) }
+    }
+
+    /// Reads a checkpoint, from the bytes or from a file in `folder`, and tries it once. Blocks.
+    ///
+    /// # Errors
+    /// If the file is not there, or for anything wrong with the checkpoint, with the reason in `got`.
+    pub(crate) fn load(folder: &Path, request: LoadModelRequest) -> Result<Self, Error> {
+        let bytes = match request.source {
+            CheckpointSource::Bytes(bytes) => bytes,
+            CheckpointSource::File(name) => read(&folder.join(&name)).map_err(|e| match e.kind() {
+                io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", name),
+                _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
+            })?,
+        };
+        let loaded =
+            checkpoint::from_bytes(&bytes).map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
+        let info = info(request.model, &loaded.agent, loaded.digest, loaded.provenance.training_tasks);
+        let model = Self { info, method: Box::new(loaded.agent) };
+        model.warm_up()?;
+        Ok(model)
+    }
+
+    /// Plans once, from black to white: the first request does not pay for it, and weights that are finite but lead to
+    /// plans that are not are found out.
+    fn warm_up(&self) -> Result<(), Error> {
+        let [x, x_g] = [0, u8::MAX].map(|level| self.encode_bytes(&vec![level; cpn::images::BYTES]));
+        self.plan(&x, &x_g, 0).map(drop).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))
+    }
+
+    /// The embedding `[1, Z]` of an image of 84 x 84.
+    pub(crate) fn encode(&self, image: &Image) -> Tensor {
+        self.encode_bytes(image.data())
+    }
+
+    fn encode_bytes(&self, image: &[u8]) -> Tensor {
+        self.method.encode(&cpn::images::from_bytes(image).expect("images are checked as they arrive"))
+    }
+
+    /// Plans from x to x_g, both `[1, Z]`.
+    ///
+    /// # Errors
+    /// If any number of the plan is not finite.
+    pub(crate) fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Result<Planned, Error> {
+        let plan = self.method.plan(x, x_g, seed);
+        let actions = plan.actions.squeeze_dim(0).unbind(0).iter().map(floats).collect::<Vec<_>>();
+        let inner_losses = plan.inner_losses.iter().flat_map(floats).collect::<Vec<_>>();
+        let latent_distance = (x.size()[1] > 0).then(|| (x - x_g).norm().double_value(&[]) as f32);
+        check_finite("actions", &actions.concat())?;
+        check_finite("inner_losses", &inner_losses)?;
+        check_finite("latent_distance", latent_distance.as_slice())?;
+        Ok(Planned { actions, inner_losses, latent_distance })
+    }
+}
+
+impl fmt::Debug for Model {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Model").field("info", &self.info).finish_non_exhaustive()
+    }
+}
+
+fn info(name: String, method: &dyn Method, digest: String, training_tasks: Vec<String>) -> ModelInfo {
+    let horizon = u32::try_from(method.horizon()).expect("a horizon is between 1 and 64");
+    ModelInfo { name, method: method.name().to_owned(), digest, training_tasks, horizon }
+}
+
+/// A regular file's bytes, one more than a checkpoint may have at most.
+fn read(path: &Path) -> io::Result<Vec<u8>> {
+    if !path.metadata()?.is_file() {
+        return Err(io::Error::other("not a regular file"));
+    }
+    let mut bytes = Vec::new();
+    File::open(path)?.take(checkpoint::MAX_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+fn check_finite(field: &str, values: &[f32]) -> Result<(), Error> {
+    match values.iter().find(|value| !value.is_finite()) {
+        Some(value) => Err(Error::new(Code::Internal, field, "finite numbers", value)),
+        None => Ok(()),
+    }
+}
+
+/// A float32 vector's values.
+fn floats(vector: &Tensor) -> Vec<f32> {
+    Vec::try_from(vector.to_kind(Kind::Float)).expect("a vector of float32")
+}

@@ -1,0 +1,320 @@
+//! A planner on loopback and a client of each of its transports.
+
+#![allow(dead_code, reason = "each test file uses its part")]
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+use cpn::checkpoint::{self, Provenance};
+use cpn::config::ConvConfig;
+use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Random};
+use planner::core::PlannerCore;
+use planner::model::Model;
+use planner::{Config, Planner};
+use prost::Message as _;
+use service_kit::SessionConfig;
+use std::future::Future;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc;
+use std::time::Duration;
+use tch::{Device, Kind, Tensor};
+use tempfile::TempDir;
+use tonic::transport::Channel;
+use wire::planner::{
+    ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest, PlanResponse, RegisterGoalRequest,
+    RegisterGoalResponse, StageTimes,
+};
+use wire::proto::planner_service_client::PlannerServiceClient;
+use wire::{Code, Error, Message, key, proto, query};
+use zenoh::Session;
+use zenoh::key_expr::OwnedKeyExpr;
+
+/// What no test should ever reach.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+/// Name of every planner here; their namespaces differ.
+pub const NAME: &str = "under-test";
+
+/// A running planner, with a second zenoh session and a gRPC channel to it.
+pub struct Fixture {
+    pub planner: Planner,
+    pub session: Session,
+    pub channel: Channel,
+    pub models_dir: TempDir,
+}
+
+impl Fixture {
+    /// Serves `checkpoints`, by name, with `configure`'s changes to the settings.
+    pub async fn start(checkpoints: &[(&str, Vec<u8>)], configure: impl FnOnce(&mut Config)) -> Self {
+        let models_dir = TempDir::new().unwrap();
+        for (name, bytes) in checkpoints {
+            std::fs::write(models_dir.path().join(format!("{name}.safetensors")), bytes).unwrap();
+        }
+        static NAMESPACES: AtomicU64 = AtomicU64::new(0);
+        let number = NAMESPACES.fetch_add(1, Ordering::Relaxed);
+        let namespace = Some(format!("test-{}-{number}", std::process::id()));
+        let ours = SessionConfig { namespace: namespace.clone(), ..SessionConfig::default() };
+        let session = service_kit::session::open(&ours).await.unwrap();
+        let planners =
+            session.liveliness().declare_subscriber(key::planner_alive("*").unwrap()).history(true).await.unwrap();
+        let connect = session.info().locators().await.iter().map(ToString::to_string).collect();
+        let mut config = Config {
+            name: NAME.into(),
+            models_dir: models_dir.path().into(),
+            grpc_listen: ([127, 0, 0, 1], 0).into(),
+            session: SessionConfig { namespace, connect, ..SessionConfig::default() },
+            ..Config::default()
+        };
+        configure(&mut config);
+        let planner = planner::start(config).await.unwrap();
+        soon(planners.recv_async()).await.unwrap();
+        let url = format!("http://{}", planner.grpc_address());
+        let channel = Channel::from_shared(url).unwrap().connect().await.unwrap();
+        Self { planner, session, channel, models_dir }
+    }
+
+    /// One client of each transport.
+    pub fn clients(&self) -> [Client; 3] {
+        [
+            Client::InProcess(self.planner.core()),
+            Client::Grpc(PlannerServiceClient::new(self.channel.clone())),
+            Client::Zenoh(self.session.clone()),
+        ]
+    }
+}
+
+/// One way to reach a planner. Requests are protobuf, so that wrong ones can be sent.
+#[derive(Clone)]
+pub enum Client {
+    InProcess(PlannerCore),
+    Grpc(PlannerServiceClient<Channel>),
+    Zenoh(Session),
+}
+
+impl Client {
+    pub fn transport(&self) -> &'static str {
+        match self {
+            Self::InProcess(_) => "in-process",
+            Self::Grpc(_) => "gRPC",
+            Self::Zenoh(_) => "zenoh",
+        }
+    }
+
+    pub async fn plan(&self, request: proto::PlanRequest) -> Result<PlanResponse, Error> {
+        match self {
+            Self::InProcess(core) => core.plan(PlanRequest::try_from(request)?).await,
+            Self::Grpc(grpc) => grpc.clone().plan(request).await?.into_inner().try_into(),
+            Self::Zenoh(session) => raw_query(session, &key::planner_plan(NAME)?, encoded(&request)).await,
+        }
+    }
+
+    pub async fn register_goal(&self, request: proto::RegisterGoalRequest) -> Result<RegisterGoalResponse, Error> {
+        match self {
+            Self::InProcess(core) => core.register_goal(RegisterGoalRequest::try_from(request)?),
+            Self::Grpc(grpc) => grpc.clone().register_goal(request).await?.into_inner().try_into(),
+            Self::Zenoh(session) => raw_query(session, &key::planner_register_goal(NAME)?, encoded(&request)).await,
+        }
+    }
+
+    pub async fn load_model(&self, request: proto::LoadModelRequest) -> Result<LoadModelResponse, Error> {
+        match self {
+            Self::InProcess(core) => core.load_model(LoadModelRequest::try_from(request)?).await,
+            Self::Grpc(grpc) => grpc.clone().load_model(request).await?.into_inner().try_into(),
+            Self::Zenoh(session) => raw_query(session, &key::planner_load_model(NAME)?, encoded(&request)).await,
+        }
+    }
+
+    pub async fn list_models(&self) -> Result<ListModelsResponse, Error> {
+        let request = proto::ListModelsRequest {};
+        match self {
+            Self::InProcess(core) => Ok(core.list_models()),
+            Self::Grpc(grpc) => grpc.clone().list_models(request).await?.into_inner().try_into(),
+            Self::Zenoh(session) => raw_query(session, &key::planner_list_models(NAME)?, encoded(&request)).await,
+        }
+    }
+
+    /// The digest that answers a plan by this model.
+    pub async fn digest(&self, model: &str) -> String {
+        self.plan(plan_request(model, 1)).await.unwrap().model_digest
+    }
+}
+
+fn encoded(request: &impl prost::Message) -> Option<Vec<u8>> {
+    Some(request.encode_to_vec())
+}
+
+/// Sends any bytes as a query's payload, or none.
+pub async fn raw_query<R: Message>(
+    session: &Session,
+    key: &OwnedKeyExpr,
+    payload: Option<Vec<u8>>,
+) -> Result<R, Error> {
+    let get = session.get(key).timeout(PATIENCE);
+    let replies = match payload {
+        Some(bytes) => get.payload(bytes).await,
+        None => get.await,
+    };
+    match replies.unwrap().recv_async().await.unwrap().into_result() {
+        Ok(sample) => wire::decode(&sample.payload().to_bytes()),
+        Err(error) => {
+            assert_eq!(*error.encoding(), query::encoding::<proto::Error>(), "zenoh's own error");
+            Err(proto::Error::decode(&*error.payload().to_bytes()).unwrap().into())
+        }
+    }
+}
+
+/// Fails instead of waiting for ever.
+pub async fn soon<F: Future>(future: F) -> F::Output {
+    tokio::time::timeout(PATIENCE, future).await.expect("nothing happened for a minute")
+}
+
+/// An image whose pixels follow from `seed`.
+pub fn image(seed: u64) -> proto::Image {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let data = (0..cpn::images::BYTES).map(|_| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state as u8
+    });
+    proto::Image { height: 84, width: 84, format: proto::PixelFormat::Rgb8.into(), data: data.collect() }
+}
+
+/// A plan from the image `seed` to the image 0.
+pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
+    proto::PlanRequest {
+        model: model.into(),
+        goal: Some(proto::plan_request::Goal::GoalImage(image(0))),
+        observation: Some(image(seed)),
+        seed,
+        deadline_ms: 0,
+    }
+}
+
+/// The answer without the times, which no two requests share.
+pub fn timeless(response: PlanResponse) -> PlanResponse {
+    PlanResponse { times: StageTimes::default(), ..response }
+}
+
+pub fn from_bytes(model: &str, checkpoint: Vec<u8>) -> proto::LoadModelRequest {
+    proto::LoadModelRequest {
+        model: model.into(),
+        source: Some(proto::load_model_request::Source::Checkpoint(checkpoint)),
+    }
+}
+
+pub fn from_file(model: &str, file: &str) -> proto::LoadModelRequest {
+    proto::LoadModelRequest { model: model.into(), source: Some(proto::load_model_request::Source::File(file.into())) }
+}
+
+/// A checkpoint of few, random weights.
+pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
+    let encoder = EncoderConfig {
+        convolutions: vec![
+            ConvConfig { channels: 3, kernel: 8, stride: 8 },
+            ConvConfig { channels: 4, kernel: 4, stride: 3 },
+        ],
+        latent: 6,
+        layer_norm: true,
+    };
+    let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
+    let training_tasks = vec!["door-lock".into(), "reach".into()];
+    let provenance = Provenance { training_tasks, data_digest: "d".into(), seed, epochs: 1 };
+    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+}
+
+/// A method that says which seed it plans for and then waits to be let on.
+pub struct Gated {
+    entered: mpsc::Sender<u64>,
+    gate: mpsc::Receiver<()>,
+}
+
+/// The test's side of a [`Gated`] method.
+pub struct Gate {
+    entered: mpsc::Receiver<u64>,
+    gate: mpsc::Sender<()>,
+}
+
+impl Gate {
+    /// Serves a gated method under the name `gated`.
+    pub async fn serve(core: &PlannerCore) -> Self {
+        let (sender, entered) = mpsc::channel();
+        let (gate, receiver) = mpsc::channel();
+        serve(core, "gated", Box::new(Gated { entered: sender, gate: receiver })).await;
+        Self { entered, gate }
+    }
+
+    /// Waits until a plan is being made; answers its seed.
+    pub async fn entered(&self) -> u64 {
+        let arrival = async {
+            loop {
+                match self.entered.try_recv() {
+                    Ok(seed) => return seed,
+                    Err(_) => tokio::time::sleep(Duration::from_millis(1)).await,
+                }
+            }
+        };
+        soon(arrival).await
+    }
+
+    /// Lets one plan on.
+    pub fn open(&self) {
+        self.gate.send(()).unwrap();
+    }
+}
+
+impl Method for Gated {
+    fn name(&self) -> &'static str {
+        "random"
+    }
+
+    fn horizon(&self) -> i64 {
+        1
+    }
+
+    fn encode(&self, images: &Tensor) -> Tensor {
+        Random { actions: 4 }.encode(images)
+    }
+
+    fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Plan {
+        self.entered.send(seed).unwrap();
+        self.gate.recv_timeout(PATIENCE).unwrap();
+        Random { actions: 4 }.plan(x, x_g, seed)
+    }
+}
+
+/// A method that fails: on even seeds its actions are not numbers, on odd ones libtorch panics.
+pub struct Faulty;
+
+impl Method for Faulty {
+    fn name(&self) -> &'static str {
+        "random"
+    }
+
+    fn horizon(&self) -> i64 {
+        1
+    }
+
+    fn encode(&self, images: &Tensor) -> Tensor {
+        Random { actions: 4 }.encode(images)
+    }
+
+    fn plan(&self, x: &Tensor, _x_g: &Tensor, seed: u64) -> Plan {
+        let actions = Tensor::full([1, 1, 4], f64::NAN, (Kind::Float, Device::Cpu));
+        let actions = if seed.is_multiple_of(2) { actions } else { actions.matmul(x) };
+        Plan { actions, inner_losses: Vec::new() }
+    }
+}
+
+pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
+    let info = ModelInfo {
+        name: name.into(),
+        method: method.name().into(),
+        digest: checkpoint::digest(name.as_bytes()),
+        training_tasks: Vec::new(),
+        horizon: 1,
+    };
+    core.serve(Model { info, method }).await.unwrap();
+}
+
+pub fn is(code: Code, field: &str, result: Result<PlanResponse, Error>) {
+    let error = result.unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (code, field), "{error}");
+}

@@ -1,0 +1,39 @@
+//! The layers of the settings.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+use clap::Parser;
+use planner::Config;
+use planner::config::Args;
+use std::io::Write;
+use tempfile::NamedTempFile;
+
+fn load(file: &str, arguments: &[&str]) -> anyhow::Result<Config> {
+    let mut toml = NamedTempFile::new()?;
+    toml.write_all(file.as_bytes())?;
+    let args = Args::try_parse_from([&["cpn-planner"], arguments].concat())?;
+    service_kit::config::load("CPN_PLANNER_TEST_", Some(toml.path()), &args)
+}
+
+#[test]
+fn what_is_not_set_is_the_default() {
+    assert_eq!(load("", &[]).unwrap(), Config::default());
+}
+
+#[test]
+fn the_command_line_wins_over_the_file() {
+    let file = "name = 'from-file'\nqueue_capacity = 7\n[session]\nlisten = ['tcp/127.0.0.1:1']\nnamespace = 'f'";
+    let config = load(file, &["--name", "typed", "--namespace", "t", "--connect", "tcp/a:1,tcp/b:2"]).unwrap();
+    assert_eq!((config.name.as_str(), config.queue_capacity.get()), ("typed", 7));
+    assert_eq!(config.session.listen, ["tcp/127.0.0.1:1"]);
+    assert_eq!(config.session.connect, ["tcp/a:1", "tcp/b:2"]);
+    assert_eq!(config.session.namespace.as_deref(), Some("t"));
+}
+
+#[test]
+fn a_wrong_setting_is_named() {
+    for (file, field) in [("queue_capacity = 0", "queue_capacity"), ("thread = 1", "thread")] {
+        let error = format!("{:#}", load(file, &[]).unwrap_err());
+        assert!(error.contains(field), "{error}");
+    }
+}

@@ -1,0 +1,165 @@
+//! One contract, held against every transport: the same request gets the same answer, whichever way it comes.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use common::{Client, Fixture, checkpoint, from_bytes, from_file, image, plan_request, timeless};
+use cpn::MethodKind;
+use planner::model::RANDOM;
+use wire::planner::{ModelInfo, PlanResponse};
+use wire::proto::plan_request::Goal;
+use wire::{Code, Error, proto};
+
+const MODELS: [&str; 5] = ["bc", "cpn", RANDOM, "te-bc", "upn"];
+
+async fn start() -> Fixture {
+    let checkpoints = MethodKind::ALL.map(|method| (method.name(), checkpoint(method, 1)));
+    Fixture::start(&checkpoints, |_| ()).await
+}
+
+/// Everything a client sees of a planner that is asked the right questions.
+async fn answers(client: &Client) -> (Vec<PlanResponse>, Vec<ModelInfo>, String) {
+    let models = client.list_models().await.unwrap().models;
+    let register = proto::RegisterGoalRequest { image: Some(image(0)) };
+    let goal_id = client.register_goal(register.clone()).await.unwrap().goal_id;
+    assert_eq!(client.register_goal(register).await.unwrap().goal_id, goal_id, "the same image, the same id");
+    let mut plans = Vec::new();
+    for model in MODELS {
+        let by_image = client.plan(plan_request(model, 3)).await.unwrap();
+        let by_id = proto::PlanRequest { goal: Some(Goal::GoalId(goal_id.clone())), ..plan_request(model, 3) };
+        for _ in 0..2 {
+            let plan = client.plan(by_id.clone()).await.unwrap();
+            let times = plan.times;
+            assert!(times.queue_seconds > 0.0 && times.encode_seconds > 0.0 && times.plan_seconds > 0.0, "{times:?}");
+            assert_eq!(timeless(plan), timeless(by_image.clone()), "{model}: by image or by id, cached or not");
+        }
+        assert_eq!(by_image.goal_id, goal_id);
+        plans.push(timeless(by_image));
+    }
+    (plans, models, goal_id)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_transport_gives_the_same_answers() {
+    let fixture = start().await;
+    let [in_process, others @ ..] = fixture.clients();
+    let expected = answers(&in_process).await;
+    for client in others {
+        assert_eq!(answers(&client).await, expected, "{}", client.transport());
+    }
+
+    let (plans, models, _) = expected;
+    assert_eq!(models.iter().map(|info| info.name.as_str()).collect::<Vec<_>>(), MODELS);
+    for (plan, info) in plans.iter().zip(&models) {
+        assert_eq!(info.method, info.name);
+        assert_eq!(plan.model_digest, info.digest);
+        assert_eq!(plan.actions.len(), info.horizon as usize, "{}", info.name);
+        let clipped: Vec<f32> = plan.actions[0].iter().map(|v| v.clamp(-1.0, 1.0)).collect();
+        assert_eq!(plan.first_action, clipped);
+        let (losses, distance) = match info.name.as_str() {
+            "upn" | "cpn" => (2, true),
+            RANDOM => (0, false),
+            _ => (0, true),
+        };
+        assert_eq!((plan.inner_losses.len(), plan.latent_distance.is_some()), (losses, distance), "{}", info.name);
+        let tasks: &[&str] = if info.name == RANDOM { &[] } else { &["door-lock", "reach"] };
+        assert_eq!(info.training_tasks, tasks);
+    }
+    fixture.planner.shutdown().await.unwrap();
+}
+
+/// A request, wrong in one respect.
+fn spoiled(spoil: impl FnOnce(&mut proto::PlanRequest)) -> proto::PlanRequest {
+    let mut request = plan_request("cpn", 3);
+    spoil(&mut request);
+    request
+}
+
+fn smaller(side: u32) -> proto::Image {
+    let data = vec![0; (side * 84 * 3) as usize];
+    proto::Image { height: side, data, ..image(0) }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_transport_refuses_alike() {
+    let fixture = start().await;
+    let unregistered = "0".repeat(64);
+    let cases = [
+        (spoiled(|r| r.observation = Some(smaller(83))), Error::invalid("observation.height", 84, 83)),
+        (
+            spoiled(|r| r.goal = Some(Goal::GoalImage(proto::Image { width: 42, height: 168, ..image(0) }))),
+            Error::invalid("goal_image.height", 84, 168),
+        ),
+        (
+            spoiled(|r| r.observation = Some(proto::Image { data: vec![0; 10], ..image(0) })),
+            Error::invalid("observation.data", "21168 bytes", "10 bytes"),
+        ),
+        (
+            spoiled(|r| r.observation = Some(proto::Image { format: 0, ..image(0) })),
+            Error::invalid("observation.format", "PIXEL_FORMAT_RGB8", "PIXEL_FORMAT_UNSPECIFIED"),
+        ),
+        (spoiled(|r| r.observation = None), Error::invalid("observation", "a value", "none")),
+        (spoiled(|r| r.goal = None), Error::invalid("goal", "a value", "none")),
+        (
+            spoiled(|r| r.model = "gpt".into()),
+            Error::new(Code::NotFound, "model", "one of bc, cpn, random, te-bc, upn", "gpt"),
+        ),
+        (
+            spoiled(|r| r.goal = Some(Goal::GoalId(unregistered.clone()))),
+            Error::new(Code::NotFound, "goal_id", "one of the 1024 goals registered last", &unregistered),
+        ),
+    ];
+    for client in fixture.clients() {
+        let transport = client.transport();
+        for (request, error) in &cases {
+            assert_eq!(client.plan(request.clone()).await.unwrap_err(), *error, "{transport}");
+            client.plan(plan_request("cpn", 3)).await.unwrap();
+        }
+        let goal = proto::RegisterGoalRequest { image: Some(smaller(1)) };
+        assert_eq!(client.register_goal(goal).await.unwrap_err(), Error::invalid("image.height", 84, 1), "{transport}");
+        let loads = [
+            (from_bytes(RANDOM, Vec::new()), Code::FailedPrecondition, "model"),
+            (from_bytes("cpn", vec![7; 99]), Code::InvalidArgument, "checkpoint"),
+            (from_file("cpn", "absent.safetensors"), Code::NotFound, "file"),
+            (from_file("cpn", "../cpn.safetensors"), Code::InvalidArgument, "file"),
+        ];
+        for (request, code, field) in loads {
+            let error = client.load_model(request).await.unwrap_err();
+            assert_eq!((error.code, error.field.as_str()), (code, field), "{transport}: {error}");
+        }
+        client.plan(plan_request("cpn", 3)).await.unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn grpc_statuses_are_used_as_meant() {
+    let fixture = start().await;
+    let [_, Client::Grpc(mut grpc), _] = fixture.clients() else { unreachable!() };
+    for (request, code) in [
+        (spoiled(|r| r.goal = None), tonic::Code::InvalidArgument),
+        (spoiled(|r| r.model = "gpt".into()), tonic::Code::NotFound),
+    ] {
+        assert_eq!(grpc.plan(request).await.unwrap_err().code(), code);
+    }
+    let status = grpc.load_model(from_bytes(RANDOM, Vec::new())).await.unwrap_err();
+    assert_eq!(status.code(), tonic::Code::FailedPrecondition);
+    assert_eq!(status.message(), "model: expected a name other than random, got random");
+}
+
+/// Registered goals give way to later ones; a client that is told so registers again.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_oldest_goal_goes_first() {
+    let fixture = Fixture::start(&[], |config| config.goal_capacity = 2.try_into().unwrap()).await;
+    let [client, ..] = fixture.clients();
+    let mut ids = Vec::new();
+    for seed in 0..3 {
+        let request = proto::RegisterGoalRequest { image: Some(image(seed)) };
+        ids.push(client.register_goal(request).await.unwrap().goal_id);
+    }
+    let towards = |id: &String| spoiled(|r| (r.model, r.goal) = (RANDOM.into(), Some(Goal::GoalId(id.clone()))));
+    common::is(Code::NotFound, "goal_id", client.plan(towards(&ids[0])).await);
+    for id in &ids[1..] {
+        assert_eq!(client.plan(towards(id)).await.unwrap().goal_id, *id);
+    }
+}

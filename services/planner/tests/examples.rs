@@ -1,0 +1,42 @@
+//! The README's examples are the files of the repository, and they work.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+use std::path::Path;
+use std::process::Command;
+
+const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
+
+#[test]
+fn the_readme_shows_the_examples_as_they_are() {
+    let readme = std::fs::read_to_string(Path::new(ROOT).join("README.md")).unwrap();
+    for file in ["examples/plan_zenoh.py", "examples/plan_grpc.py", "services/planner/examples/plan.rs"] {
+        let example = std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
+        assert!(readme.contains(&example), "README.md: expected the text of {file}");
+    }
+}
+
+/// Runs an example of the sim-worker's environment against a planner with the shipped checkpoints.
+async fn run(example: &str, endpoint: String) {
+    let python = Path::new(ROOT).join("sim-worker/.venv/bin/python");
+    let mut command = Command::new(python);
+    command.current_dir(ROOT).args([example, "examples/goal.png", "examples/frame.png", &endpoint]);
+    let output = tokio::task::spawn_blocking(move || command.output().unwrap()).await.unwrap();
+    let (text, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success() && text.contains("of 5 planned actions"), "{text}{errors}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_python_examples_get_plans() {
+    let endpoint = "tcp/127.0.0.1:17481";
+    let config = planner::Config {
+        models_dir: Path::new(ROOT).join("models"),
+        grpc_listen: "127.0.0.1:0".parse().unwrap(),
+        session: service_kit::SessionConfig { listen: vec![endpoint.into()], ..Default::default() },
+        ..planner::Config::default()
+    };
+    let planner = planner::start(config).await.unwrap();
+    run("examples/plan_zenoh.py", endpoint.into()).await;
+    run("examples/plan_grpc.py", planner.grpc_address().to_string()).await;
+    planner.shutdown().await.unwrap();
+}

@@ -1,0 +1,138 @@
+//! The model thread under load and under fault, with a method that waits until the test lets it on.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use common::{Client, Faulty, Fixture, Gate, image, is, plan_request, soon};
+use planner::core::PlannerCore;
+use planner::model::RANDOM;
+use std::future::Future;
+use std::pin::Pin;
+use wire::planner::{PlanRequest, PlanResponse};
+use wire::{Code, Error, proto};
+
+type Answer = Pin<Box<dyn Future<Output = Result<PlanResponse, Error>> + Send>>;
+
+/// Puts a plan in the queue; its answer is awaited later, or dropped.
+async fn enqueue(core: &PlannerCore, request: proto::PlanRequest) -> Answer {
+    let core = core.clone();
+    let request = PlanRequest::try_from(request).unwrap();
+    let mut answer: Answer = Box::pin(async move { core.plan(request).await });
+    tokio::select! {
+        biased;
+        result = &mut answer => panic!("answered at once: {result:?}"),
+        () = async {} => answer,
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_queue_refuses_and_recovers() {
+    let fixture = Fixture::start(&[], |config| config.queue_capacity = 2.try_into().unwrap()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    let running = enqueue(&core, plan_request("gated", 1)).await;
+    assert_eq!(gate.entered().await, 1);
+    let waiting = [enqueue(&core, plan_request("gated", 2)).await, enqueue(&core, plan_request(RANDOM, 3)).await];
+    for client in fixture.clients() {
+        let error = client.plan(plan_request(RANDOM, 4)).await.unwrap_err();
+        let full = Error::new(Code::ResourceExhausted, "queue", "a free place", "2 waiting");
+        assert_eq!(error, full, "{}", client.transport());
+        // What needs no plan is answered all the same.
+        client.register_goal(proto::RegisterGoalRequest { image: Some(image(9)) }).await.unwrap();
+        client.list_models().await.unwrap();
+    }
+    gate.open();
+    gate.open();
+    running.await.unwrap();
+    for answer in waiting {
+        answer.await.unwrap();
+    }
+    for client in fixture.clients() {
+        client.plan(plan_request(RANDOM, 4)).await.unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_queue_does_not_hinder_a_swap() {
+    let fixture = Fixture::start(&[], |config| config.queue_capacity = 1.try_into().unwrap()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    let running = enqueue(&core, plan_request("gated", 1)).await;
+    assert_eq!(gate.entered().await, 1);
+    let waiting = enqueue(&core, plan_request(RANDOM, 2)).await;
+    let swap = tokio::spawn({
+        let core = core.clone();
+        async move { common::serve(&core, "new", Box::new(cpn::Random { actions: 2 })).await }
+    });
+    gate.open();
+    soon(swap).await.unwrap();
+    running.await.unwrap();
+    waiting.await.unwrap();
+    let [client, ..] = fixture.clients();
+    assert_eq!(client.plan(plan_request("new", 3)).await.unwrap().first_action.len(), 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_deadline_that_passes_in_the_queue_is_told_and_not_planned() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    let running = enqueue(&core, plan_request("gated", 1)).await;
+    assert_eq!(gate.entered().await, 1);
+    for client in fixture.clients() {
+        let request = proto::PlanRequest { deadline_ms: 5, ..plan_request("gated", 2) };
+        let error = soon(client.plan(request)).await.unwrap_err();
+        let late = Error::new(Code::DeadlineExceeded, "deadline_ms", "an answer within 5 ms", "none");
+        assert_eq!(error, late, "{}", client.transport());
+    }
+    let next = enqueue(&core, plan_request("gated", 3)).await;
+    gate.open();
+    assert_eq!(gate.entered().await, 3, "those in between were not planned");
+    gate.open();
+    running.await.unwrap();
+    next.await.unwrap();
+}
+
+/// A deadline holds for a plan that is being made, too.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_plan_that_takes_too_long_is_given_up() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    let slow = enqueue(&core, proto::PlanRequest { deadline_ms: 300, ..plan_request("gated", 1) }).await;
+    assert_eq!(gate.entered().await, 1);
+    is(Code::DeadlineExceeded, "deadline_ms", soon(slow).await);
+    gate.open();
+    let [client, ..] = fixture.clients();
+    client.plan(plan_request(RANDOM, 2)).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn clients_that_give_up_do_not_disturb() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    let [_, grpc @ Client::Grpc(_), _] = fixture.clients() else { unreachable!() };
+    let gone_while_planning = tokio::spawn(async move { grpc.plan(plan_request("gated", 1)).await });
+    assert_eq!(gate.entered().await, 1);
+    drop(enqueue(&core, plan_request("gated", 2)).await);
+    let next = enqueue(&core, plan_request("gated", 3)).await;
+    gone_while_planning.abort();
+    assert!(gone_while_planning.await.unwrap_err().is_cancelled());
+    gate.open();
+    assert_eq!(gate.entered().await, 3, "the one that was dropped in the queue was not planned");
+    gate.open();
+    next.await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_failing_plan_fails_alone() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    common::serve(&fixture.planner.core(), "faulty", Box::new(Faulty)).await;
+    for client in fixture.clients() {
+        is(Code::Internal, "actions", client.plan(plan_request("faulty", 2)).await);
+        is(Code::Internal, "plan", client.plan(plan_request("faulty", 3)).await);
+        client.plan(plan_request(RANDOM, 4)).await.unwrap();
+    }
+}
