@@ -1,6 +1,7 @@
-//! What every service needs around its work: configuration, logs, shutdown, a zenoh session.
+//! What every service needs around its work: configuration, files, logs, shutdown, a zenoh session.
 
 pub mod config;
+pub mod files;
 pub mod session;
 pub mod shutdown;
 pub mod telemetry;

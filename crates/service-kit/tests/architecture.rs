@@ -33,7 +33,10 @@ fn each_crate_knows_only_what_it_may() {
         ("evaluator", &["wire", "service-kit"]),
     ]);
     let dependencies = dependencies();
-    assert_eq!(dependencies.keys().map(String::as_str).collect::<Vec<_>>(), allowed.keys().copied().collect::<Vec<_>>());
+    assert_eq!(
+        dependencies.keys().map(String::as_str).collect::<Vec<_>>(),
+        allowed.keys().copied().collect::<Vec<_>>()
+    );
     for (name, known) in &dependencies {
         let ours: BTreeSet<_> = known.iter().map(String::as_str).filter(|k| allowed.contains_key(k)).collect();
         assert_eq!(ours, allowed[name.as_str()].iter().copied().collect(), "{name}");

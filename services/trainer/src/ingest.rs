@@ -5,8 +5,8 @@
 //! by committing, and a stream can be sent again without harm.
 
 use crate::episode::Episode;
-use crate::files;
 use lru::LruCache;
+use service_kit::files;
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};

@@ -7,7 +7,6 @@
 pub mod adam;
 pub mod dataset;
 pub mod episode;
-pub mod files;
 pub mod ingest;
 pub mod publish;
 pub mod service;

@@ -2,13 +2,13 @@
 
 use crate::adam::Adam;
 use crate::dataset::Dataset;
-use crate::files;
 use anyhow::{Context, ensure};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
 use cpn::{Agent, MethodKind, ModelConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
+use service_kit::files;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

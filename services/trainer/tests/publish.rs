@@ -2,16 +2,15 @@
 
 use cpn::checkpoint::{self, Provenance};
 use cpn::{Agent, MethodKind, ModelConfig};
-use service_kit::SessionConfig;
+use service_kit::{SessionConfig, files};
 use std::path::Path;
 use std::time::Duration;
-use trainer::{files, service};
+use trainer::service;
 use wire::planner::ModelInfo;
 
 fn publish(folder: &Path, seed: u64) -> String {
     let agent = Agent::new(ModelConfig::paper(MethodKind::TeBc), seed);
-    let provenance =
-        Provenance { training_tasks: vec!["reach".into()], data_digest: String::new(), seed, epochs: 1 };
+    let provenance = Provenance { training_tasks: vec!["reach".into()], data_digest: String::new(), seed, epochs: 1 };
     let bytes = checkpoint::to_bytes(&agent, &provenance).unwrap();
     files::write_atomically(&folder.join("te-bc.safetensors"), &bytes).unwrap();
     checkpoint::digest(&bytes)

@@ -52,12 +52,8 @@ fn a_state_of_another_run_is_not_taken_up() {
 fn the_checkpoint_tells_where_it_comes_from() {
     let folder = tempfile::tempdir().unwrap();
     for method in MethodKind::ALL {
-        let config = Config {
-            method,
-            epochs: 1,
-            hold_out: vec!["door-lock".into()],
-            ..config(folder.path(), method.name())
-        };
+        let config =
+            Config { method, epochs: 1, hold_out: vec!["door-lock".into()], ..config(folder.path(), method.name()) };
         let digest = finished(&config);
         let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
         assert_eq!(loaded.digest, digest);

@@ -1,0 +1,75 @@
+//! The command line.
+
+use clap::{Args, Parser, Subcommand, value_parser};
+use service_kit::SessionConfig;
+use std::path::PathBuf;
+
+/// Measures first-attempt success in closed loop, and reports it.
+#[derive(Debug, Parser)]
+#[command(name = "cpn-eval", version)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run every model on every variation of every task, then report; trials that the folder already holds are kept.
+    Run(RunArgs),
+    /// Report again from the records of a run.
+    Report(ReportArgs),
+}
+
+/// Arguments of `run`.
+#[derive(Debug, Clone, Args)]
+pub struct RunArgs {
+    /// Name of the planner to ask.
+    #[arg(long, default_value = "planner")]
+    pub planner: String,
+    /// Simulator workers to wait for; all that are alive are used.
+    #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
+    pub workers: u32,
+    /// Models to compare; every model of the planner if not given.
+    #[arg(long, value_delimiter = ',')]
+    pub models: Vec<String>,
+    /// Tasks to evaluate on.
+    #[arg(long, value_delimiter = ',', required = true)]
+    pub tasks: Vec<String>,
+    /// Variations of each task.
+    #[arg(long, default_value_t = 20, value_parser = value_parser!(u32).range(1..=100_000))]
+    pub trials: u32,
+    /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations.
+    #[arg(long, default_value_t = 1_000_000, value_parser = value_parser!(u64).range(..1 << 47))]
+    pub first_seed: u64,
+    /// Folder of the records and the report.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Title of the report.
+    #[arg(long, default_value = "First-attempt success rate")]
+    pub title: String,
+    /// Print the summary as JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    /// How long a planner or worker may take for an answer.
+    #[arg(long, default_value_t = 10, value_parser = value_parser!(u64).range(1..=3600))]
+    pub timeout_secs: u64,
+    /// How long to wait for the planner and the workers, at the start and whenever none is left.
+    #[arg(long, default_value_t = 60, value_parser = value_parser!(u64).range(1..=86_400))]
+    pub wait_secs: u64,
+    /// How to join the planner and the workers.
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// Arguments of `report`.
+#[derive(Debug, Clone, Args)]
+pub struct ReportArgs {
+    /// Folder of the records and the report.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Print the summary as JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}

@@ -1,0 +1,231 @@
+//! What a run leaves in its folder: one file that describes it, and one for each trial.
+
+use anyhow::{Context, ensure};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use service_kit::files::write_atomically;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use wire::planner::ModelInfo;
+
+/// Version of the files; another one is refused.
+pub const FORMAT: u32 = 1;
+
+/// What was compared, and how.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Run {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// Title of the report.
+    pub title: String,
+    /// The command line.
+    pub command: String,
+    /// When it was started, RFC 3339.
+    pub date: String,
+    /// Name of the planner.
+    pub planner: String,
+    /// The compared models, in the order of the command line.
+    pub models: Vec<Model>,
+    /// The tasks, in the order of the command line.
+    pub tasks: Vec<String>,
+    /// Variations of each task.
+    pub trials: u32,
+    /// Seed of the first variation.
+    pub first_seed: u64,
+}
+
+/// A model as the planner served it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Model {
+    /// Name it is served under.
+    pub name: String,
+    /// `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    pub method: String,
+    /// SHA-256 of its checkpoint, in hex.
+    pub digest: String,
+    /// Tasks it was trained on.
+    pub training_tasks: Vec<String>,
+    /// Number of actions in a plan.
+    pub horizon: u32,
+}
+
+impl From<ModelInfo> for Model {
+    fn from(info: ModelInfo) -> Self {
+        let ModelInfo { name, method, digest, training_tasks, horizon } = info;
+        Self { name, method, digest, training_tasks, horizon }
+    }
+}
+
+/// One first attempt of one model at one variation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Trial {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// The variation's task.
+    pub task: String,
+    /// The variation's seed.
+    pub seed: u64,
+    /// Name of the model.
+    pub model: String,
+    /// SHA-256 of its checkpoint, in hex.
+    pub model_digest: String,
+    /// How it ended.
+    #[serde(flatten)]
+    pub outcome: Outcome,
+    /// What happened until then; none after an error.
+    pub episode: Option<Episode>,
+}
+
+/// How a trial ended.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "outcome", rename_all = "lowercase")]
+pub enum Outcome {
+    /// The task was solved.
+    Success,
+    /// The steps ran out.
+    Failure,
+    /// The trial was not brought to an end, which says nothing about the model.
+    Error {
+        /// What went wrong.
+        message: String,
+    },
+}
+
+/// The course of an episode. A number that is not finite is recorded as none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Episode {
+    /// Id under which the planner knew the goal image.
+    pub goal_id: String,
+    /// Actions applied.
+    pub steps: u32,
+    /// Distance between the embeddings of observation and goal before each step; empty for a method without embedding.
+    pub latent_distances: Vec<Option<f32>>,
+    /// Inner loss before each update and after the last, of the first plan.
+    pub first_inner_losses: Vec<Option<f32>>,
+    /// The same of the last plan.
+    pub last_inner_losses: Vec<Option<f32>>,
+    /// Where the planner's time went.
+    pub mean_times: StageTimes,
+}
+
+/// Where the planner's time went, mean over the plans of an episode.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct StageTimes {
+    /// Waiting for the model.
+    pub queue_seconds: f64,
+    /// Embedding the observation and, if it was not cached, the goal.
+    pub encode_seconds: f64,
+    /// Planning.
+    pub plan_seconds: f64,
+}
+
+/// The folder of a run.
+#[derive(Debug, Clone)]
+pub struct Folder {
+    root: PathBuf,
+}
+
+impl Folder {
+    /// The folder at a path, which need not exist.
+    pub fn new(root: impl Into<PathBuf>) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// Where a file or folder of the run lies.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.root.join(name)
+    }
+
+    /// Writes what the run is.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn write_run(&self, run: &Run) -> anyhow::Result<()> {
+        write_json(&self.path("run.json"), run)
+    }
+
+    /// Reads what the run is.
+    pub(crate) fn read_run(&self) -> anyhow::Result<Run> {
+        let path = self.path("run.json");
+        let run: Run = read_json(&path)?;
+        ensure!(run.format == FORMAT, "{}: expected format {FORMAT}, got {}", path.display(), run.format);
+        Ok(run)
+    }
+
+    /// Writes a trial over any earlier one of the same model and variation.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn write_trial(&self, trial: &Trial) -> anyhow::Result<()> {
+        write_json(&self.trial_path(&trial.task, &trial.model, trial.seed), trial)
+    }
+
+    /// Remembers that a variation has no goal image: it is left out for all models.
+    pub(crate) fn skip(&self, task: &str, seed: u64) -> anyhow::Result<()> {
+        write_atomically(&self.root.join("skipped").join(task).join(seed.to_string()), &[])
+    }
+
+    /// The seeds of a task that are left out.
+    pub(crate) fn skipped(&self, task: &str) -> anyhow::Result<BTreeSet<u64>> {
+        Ok(file_names(&self.root.join("skipped").join(task))?.iter().filter_map(|name| name.parse().ok()).collect())
+    }
+
+    /// The run's trials that the folder holds: of its models with their present digests, at most `run.trials` seeds of
+    /// each task. Ordered by task, seed and model.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or is of another format.
+    pub fn trials(&self, run: &Run) -> anyhow::Result<Vec<Trial>> {
+        let mut selected = Vec::new();
+        for task in &run.tasks {
+            let skipped = self.skipped(task)?;
+            let mut by_seed: BTreeMap<u64, Vec<Trial>> = BTreeMap::new();
+            for model in &run.models {
+                let seeds = self.seeds(task, &model.name)?;
+                for seed in seeds.range(run.first_seed..).filter(|seed| !skipped.contains(seed)) {
+                    let path = self.trial_path(task, &model.name, *seed);
+                    let trial: Trial = read_json(&path)?;
+                    let format = trial.format;
+                    ensure!(format == FORMAT, "{}: expected format {FORMAT}, got {format}", path.display());
+                    if trial.model_digest == model.digest {
+                        by_seed.entry(*seed).or_default().push(trial);
+                    }
+                }
+            }
+            selected.extend(by_seed.into_values().take(run.trials as usize).flatten());
+        }
+        Ok(selected)
+    }
+
+    fn trial_path(&self, task: &str, model: &str, seed: u64) -> PathBuf {
+        self.root.join("trials").join(task).join(model).join(format!("{seed}.json"))
+    }
+
+    /// The seeds with a record.
+    fn seeds(&self, task: &str, model: &str) -> anyhow::Result<BTreeSet<u64>> {
+        let folder = self.root.join("trials").join(task).join(model);
+        let names = file_names(&folder)?;
+        Ok(names.iter().filter_map(|name| name.strip_suffix(".json")?.parse().ok()).collect())
+    }
+}
+
+/// The names in a folder; none if there is no such folder.
+pub(crate) fn file_names(folder: &Path) -> anyhow::Result<Vec<String>> {
+    let names = match fs::read_dir(folder) {
+        Ok(entries) => entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect(),
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        Err(e) => Err(e),
+    };
+    names.with_context(|| format!("listing {}", folder.display()))
+}
+
+pub(crate) fn write_json<T: Serialize>(path: &Path, value: &T) -> anyhow::Result<()> {
+    write_atomically(path, &serde_json::to_vec_pretty(value)?)
+}
+
+fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+    let bytes = fs::read(path).with_context(|| format!("reading {}", path.display()))?;
+    serde_json::from_slice(&bytes).with_context(|| format!("reading {}", path.display()))
+}

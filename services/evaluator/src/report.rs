@@ -1,0 +1,173 @@
+//! The report as one HTML file that needs nothing else.
+
+use crate::chart::{BarChart, Line};
+use crate::filmstrip::{self, Filmstrip};
+use crate::record::{Folder, Outcome, Run, Trial};
+use crate::summary::{Row, Summary};
+use anyhow::Context;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use minijinja::Environment;
+use minijinja::value::Serde;
+use serde::Serialize;
+use std::collections::BTreeSet;
+
+const TEMPLATE: &str = include_str!("../templates/report.html");
+
+/// Colours for so many models are told apart; then they begin anew.
+const COLOURS: usize = 6;
+
+/// What the template is given.
+#[derive(Debug, Serialize)]
+struct Page<'a> {
+    run: &'a Run,
+    confidence: String,
+    interval_method: &'a str,
+    errors: usize,
+    legend: Vec<LegendEntry<'a>>,
+    /// Each task with its seeds.
+    seeds: Vec<(&'a str, String)>,
+    chart: BarChart,
+    /// The rows of each task.
+    tasks: Vec<&'a [TableRow<'a>]>,
+    version: &'a str,
+}
+
+/// A model in the set-up and the legend.
+#[derive(Debug, Serialize)]
+struct LegendEntry<'a> {
+    name: &'a str,
+    method: &'a str,
+    digest: &'a str,
+    horizon: u32,
+    training_tasks: &'a [String],
+    /// Class of its colour.
+    colour: String,
+}
+
+/// A row of the table.
+#[derive(Debug, Serialize)]
+struct TableRow<'a> {
+    #[serde(flatten)]
+    row: &'a Row,
+    training_label: &'static str,
+    colour: String,
+    /// Its first success and first failure.
+    success: Option<Strip>,
+    failure: Option<Strip>,
+}
+
+/// A filmstrip with what is told about its trial.
+#[derive(Debug, Serialize)]
+struct Strip {
+    seed: u64,
+    steps: u32,
+    /// Images are base64 of PNGs.
+    goal: String,
+    frames: Vec<Frame>,
+    distance: Option<Line>,
+    first_inner_losses: Vec<Option<f32>>,
+    last_inner_losses: Vec<Option<f32>>,
+    /// Mean times in milliseconds.
+    encode_ms: f64,
+    plan_ms: f64,
+    queue_ms: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Frame {
+    step: u32,
+    png: String,
+}
+
+/// The report of a run.
+///
+/// # Errors
+/// If frames cannot be read.
+pub(crate) fn html(summary: &Summary, trials: &[Trial], folder: &Folder) -> anyhow::Result<String> {
+    let models = summary.run.models.len();
+    let mut rows = Vec::new();
+    for (index, row) in summary.rows.iter().enumerate() {
+        let of_row: Vec<_> = trials.iter().filter(|t| t.task == row.task && t.model == row.model).collect();
+        rows.push(TableRow {
+            row,
+            training_label: row.training.label(),
+            colour: colour(&summary.run, index % models),
+            success: strip(&of_row, &Outcome::Success, folder)?,
+            failure: strip(&of_row, &Outcome::Failure, folder)?,
+        });
+    }
+    let page = Page {
+        run: &summary.run,
+        confidence: format!("{:.0} %", 100.0 * summary.confidence),
+        interval_method: summary.interval_method,
+        errors: summary.errors(),
+        legend: (0..models).map(|index| legend_entry(&summary.run, index)).collect(),
+        seeds: summary.run.tasks.iter().map(|task| (task.as_str(), seeds(trials, task))).collect(),
+        chart: BarChart::new(summary),
+        tasks: rows.chunks(models).collect(),
+        version: env!("CARGO_PKG_VERSION"),
+    };
+    let mut environment = Environment::new();
+    environment.add_template("report.html", TEMPLATE).context("the report's template")?;
+    let template = environment.get_template("report.html").context("the report's template")?;
+    template.render(Serde(&page)).context("the report's template")
+}
+
+fn legend_entry(run: &Run, index: usize) -> LegendEntry<'_> {
+    let model = &run.models[index];
+    LegendEntry {
+        name: &model.name,
+        method: &model.method,
+        digest: &model.digest,
+        horizon: model.horizon,
+        training_tasks: &model.training_tasks,
+        colour: colour(run, index),
+    }
+}
+
+/// Class of a model's colour: grey for random, else by its place among the others.
+fn colour(run: &Run, index: usize) -> String {
+    if run.models[index].method == "random" {
+        return "control".into();
+    }
+    let others = run.models[..index].iter().filter(|model| model.method != "random").count();
+    format!("c{}", others % COLOURS)
+}
+
+/// The filmstrip of the first trial with an outcome.
+fn strip(trials: &[&Trial], outcome: &Outcome, folder: &Folder) -> anyhow::Result<Option<Strip>> {
+    for trial in trials.iter().filter(|trial| trial.outcome == *outcome) {
+        let (Some(filmstrip), Some(episode)) = (filmstrip::read(folder, trial)?, &trial.episode) else { continue };
+        let Filmstrip { goal, frames } = filmstrip;
+        let ms = |seconds: f64| 1e3 * seconds;
+        return Ok(Some(Strip {
+            seed: trial.seed,
+            steps: episode.steps,
+            goal: STANDARD.encode(goal),
+            distance: Line::new(&episode.latent_distances, episode.steps, frames.len()),
+            frames: frames.into_iter().map(|(step, png)| Frame { step, png: STANDARD.encode(png) }).collect(),
+            first_inner_losses: episode.first_inner_losses.clone(),
+            last_inner_losses: episode.last_inner_losses.clone(),
+            encode_ms: ms(episode.mean_times.encode_seconds),
+            plan_ms: ms(episode.mean_times.plan_seconds),
+            queue_ms: ms(episode.mean_times.queue_seconds),
+        }));
+    }
+    Ok(None)
+}
+
+/// The seeds of a task's variations as ranges: `1000000–1000003, 1000005`.
+fn seeds(trials: &[Trial], task: &str) -> String {
+    let seeds: BTreeSet<u64> = trials.iter().filter(|trial| trial.task == task).map(|trial| trial.seed).collect();
+    let mut ranges: Vec<(u64, u64)> = Vec::new();
+    for seed in seeds {
+        match ranges.last_mut() {
+            Some((_, last)) if *last + 1 == seed => *last = seed,
+            _ => ranges.push((seed, seed)),
+        }
+    }
+    let range =
+        |(first, last): &(u64, u64)| if first == last { first.to_string() } else { format!("{first}–{last}") };
+    ranges.iter().map(range).collect::<Vec<_>>().join(", ")
+}

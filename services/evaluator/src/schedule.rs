@@ -1,0 +1,171 @@
+//! Hands trials to the workers that are alive, one at a time each.
+
+use crate::filmstrip;
+use crate::presence::Alive;
+use crate::progress::Progress;
+use crate::queue::{Job, Queue};
+use crate::record::{FORMAT, Folder, Outcome, Run, Trial};
+use crate::trial::{self, Attempt, Fault, Link};
+use anyhow::{Context, bail};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use wire::sim::Variation;
+
+/// Pause of a worker after a fault: long enough for liveliness to tell whether the worker or the planner is gone.
+const PAUSE: Duration = Duration::from_secs(1);
+
+/// An evaluation under way.
+#[derive(Debug)]
+pub(crate) struct Schedule {
+    run: Arc<Run>,
+    folder: Folder,
+    link: Link,
+    queue: Queue,
+    /// Workers with a trial under way.
+    busy: BTreeSet<String>,
+    /// The task each worker is at.
+    at: BTreeMap<String, String>,
+    running: JoinSet<Finished>,
+    progress: Progress,
+}
+
+/// What became of a trial.
+#[derive(Debug)]
+struct Finished {
+    worker: String,
+    job: Job,
+    result: Result<Attempt, Fault>,
+}
+
+impl Schedule {
+    /// Everything of the run that is not in the folder yet; errors are tried again.
+    pub(crate) fn new(run: Arc<Run>, folder: Folder, link: Link) -> anyhow::Result<Self> {
+        let mut finished = BTreeSet::new();
+        for trial in folder.trials(&run)? {
+            if let Some(model) = run.models.iter().position(|model| model.name == trial.model)
+                && !matches!(trial.outcome, Outcome::Error { .. })
+            {
+                finished.insert((Variation { task: trial.task, seed: trial.seed }, model));
+            }
+        }
+        let skipped = run.tasks.iter().map(|task| Ok((task.clone(), folder.skipped(task)?)));
+        let queue = Queue::new(&run, finished, skipped.collect::<anyhow::Result<_>>()?);
+        let total = run.tasks.len() * run.models.len() * run.trials as usize;
+        let progress = Progress::new(total, queue.len(), run.models.iter().map(|model| model.name.clone()));
+        let (busy, at, running) = (BTreeSet::new(), BTreeMap::new(), JoinSet::new());
+        Ok(Self { run, folder, link, queue, busy, at, running, progress })
+    }
+
+    /// Runs every trial. Without planner or worker it waits for `patience`, then records what is left as errors.
+    ///
+    /// # Errors
+    /// If a request is refused as wrong, a record cannot be written, or the user interrupts.
+    pub(crate) async fn drive(mut self, mut alive: watch::Receiver<Alive>, patience: Duration) -> anyhow::Result<()> {
+        let interrupted = service_kit::shutdown::requested();
+        tokio::pin!(interrupted);
+        loop {
+            self.assign(&alive.borrow_and_update().clone());
+            if self.running.is_empty() && self.queue.len() == 0 {
+                return Ok(());
+            }
+            let idle = self.running.is_empty();
+            if idle {
+                let patience_secs = patience.as_secs();
+                self.progress.say(|| tracing::warn!("waiting up to {patience_secs} s for a planner and a worker"));
+            }
+            tokio::select! {
+                Some(finished) = self.running.join_next() => self.finish(finished.context("running a trial")?)?,
+                changed = alive.changed() => changed.context("following liveliness tokens")?,
+                () = tokio::time::sleep(patience), if idle => return self.give_up(patience),
+                signal = &mut interrupted => {
+                    signal.context("listening to signals")?;
+                    bail!("interrupted with {} trials left; the same command goes on from here", self.left());
+                }
+            }
+        }
+    }
+
+    /// Gives each idle worker a trial, as long as there is somebody to plan.
+    fn assign(&mut self, alive: &Alive) {
+        if !alive.planner {
+            return;
+        }
+        for worker in alive.workers.difference(&self.busy.clone()) {
+            let Some(job) = self.queue.next(self.at.get(worker).map(String::as_str)) else { return };
+            self.busy.insert(worker.clone());
+            self.at.insert(worker.clone(), job.variation.task.clone());
+            let (run, link, worker) = (self.run.clone(), self.link.clone(), worker.clone());
+            self.running.spawn(async move {
+                let result = trial::attempt(&link, &worker, &run.models[job.model], &job.variation).await;
+                if matches!(result, Err(Fault::Broken(_))) {
+                    tokio::time::sleep(PAUSE).await;
+                }
+                Finished { worker, job, result }
+            });
+        }
+    }
+
+    fn finish(&mut self, Finished { worker, job, result }: Finished) -> anyhow::Result<()> {
+        self.busy.remove(&worker);
+        let model = &self.run.models[job.model].name;
+        let Variation { task, seed } = &job.variation;
+        match result {
+            _ if self.queue.is_skipped(&job.variation) => (),
+            Ok(attempt) => {
+                let trial = self.record(&job, attempt.outcome.clone(), Some(&attempt))?;
+                filmstrip::keep(&self.folder, &trial, &attempt)?;
+                self.progress.count(job.model, attempt.outcome == Outcome::Success);
+            }
+            Err(Fault::NoGoalImage) => {
+                self.progress.say(|| tracing::info!("{task} {seed}: skipped, the expert does not solve it"));
+                self.queue.skip(&job.variation);
+                self.folder.skip(task, *seed)?;
+            }
+            Err(Fault::Refused(error)) => bail!("{task} {seed}, {model}, worker {worker}: refused: {error}"),
+            Err(Fault::Broken(error)) => {
+                let message = format!("worker {worker}: {error}");
+                if job.again {
+                    self.progress.say(|| tracing::error!("{task} {seed}, {model}: {message}"));
+                    self.record(&job, Outcome::Error { message }, None)?;
+                } else {
+                    self.progress.say(|| tracing::warn!("{task} {seed}, {model}: {message}; will be tried once more"));
+                    self.queue.retry(job);
+                }
+            }
+        }
+        self.progress.left(self.left());
+        Ok(())
+    }
+
+    fn record(&self, job: &Job, outcome: Outcome, attempt: Option<&Attempt>) -> anyhow::Result<Trial> {
+        let model = &self.run.models[job.model];
+        let trial = Trial {
+            format: FORMAT,
+            task: job.variation.task.clone(),
+            seed: job.variation.seed,
+            model: model.name.clone(),
+            model_digest: model.digest.clone(),
+            outcome,
+            episode: attempt.map(|attempt| attempt.episode.clone()),
+        };
+        self.folder.write_trial(&trial)?;
+        Ok(trial)
+    }
+
+    fn give_up(mut self, patience: Duration) -> anyhow::Result<()> {
+        let jobs = self.queue.drain();
+        let message = format!("no planner or no worker was alive for {} s", patience.as_secs());
+        self.progress.say(|| tracing::error!("{message}: {} trials were not run", jobs.len()));
+        for job in jobs {
+            self.record(&job, Outcome::Error { message: message.clone() }, None)?;
+        }
+        Ok(())
+    }
+
+    fn left(&self) -> usize {
+        self.queue.len() + self.running.len()
+    }
+}

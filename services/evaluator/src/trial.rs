@@ -1,0 +1,268 @@
+//! One first attempt: closes the loop between a simulator worker and the planner.
+
+use crate::record::{self, Model, Outcome, StageTimes};
+use std::time::Duration;
+use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
+use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
+use wire::{Code, Error, Image, Message, key, query};
+use zenoh::Session;
+use zenoh::key_expr::OwnedKeyExpr;
+
+/// How to reach the planner and the workers.
+#[derive(Debug, Clone)]
+pub(crate) struct Link {
+    pub(crate) session: Session,
+    /// Name of the planner.
+    pub(crate) planner: String,
+    /// How long an answer may take.
+    pub(crate) timeout: Duration,
+}
+
+/// An attempt that came to its end.
+#[derive(Debug)]
+pub(crate) struct Attempt {
+    pub(crate) outcome: Outcome,
+    pub(crate) episode: record::Episode,
+    /// What the finished task looks like.
+    pub(crate) goal: Image,
+    /// Every frame from the first on, one more than steps.
+    pub(crate) frames: Vec<Image>,
+}
+
+/// Why an attempt came to no end.
+#[derive(Debug)]
+pub(crate) enum Fault {
+    /// The expert does not solve the variation, hence there is no goal image: nobody can be evaluated on it.
+    NoGoalImage,
+    /// A request that is wrong and will stay wrong.
+    Refused(Error),
+    /// Another attempt may fare better.
+    Broken(Error),
+}
+
+impl From<Error> for Fault {
+    fn from(error: Error) -> Self {
+        match error.code {
+            Code::FailedPrecondition if error.field == "variation.seed" => Self::NoGoalImage,
+            Code::InvalidArgument => Self::Refused(error),
+            _ => Self::Broken(error),
+        }
+    }
+}
+
+/// Runs one episode: plans anew at each step and applies the first action (model predictive control).
+pub(crate) async fn attempt(link: &Link, worker: &str, model: &Model, variation: &Variation) -> Result<Attempt, Fault> {
+    let reset = ResetRequest { variation: variation.clone() };
+    let reset: ResetResponse = link.call(key::sim_reset(worker)?, reset).await?;
+    let mut goal_id = link.register_goal(&reset.goal).await?;
+    let step_key = key::sim_step(worker)?;
+    let mut log = Log::default();
+    let mut frames = vec![reset.observation];
+    for step in 0..reset.max_steps {
+        let request = |goal_id: &str| PlanRequest {
+            model: model.name.clone(),
+            goal: Goal::Id(goal_id.to_owned()),
+            observation: frames[frames.len() - 1].clone(),
+            seed: plan_seed(variation.seed, step),
+            deadline: Some(link.timeout),
+        };
+        let mut plan = link.plan(request(&goal_id)).await;
+        if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
+            // The planner was restarted, or has evicted the goal.
+            goal_id = link.register_goal(&reset.goal).await?;
+            plan = link.plan(request(&goal_id)).await;
+        }
+        let plan = plan?;
+        if plan.model_digest != model.digest {
+            let error = Error::new(Code::FailedPrecondition, "model_digest", &model.digest, plan.model_digest);
+            return Err(Fault::Broken(error));
+        }
+        log.add(&plan);
+        let request = StepRequest { episode_id: reset.episode_id.clone(), step, action: plan.first_action };
+        let response: StepResponse = link.call(step_key.clone(), request).await?;
+        frames.push(response.observation);
+        if response.done {
+            let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
+            return Ok(Attempt { outcome, episode: log.finish(goal_id), goal: reset.goal, frames });
+        }
+    }
+    let expected = format!("true after {} steps", reset.max_steps);
+    Err(Fault::Broken(Error::new(Code::Internal, "done", expected, false)))
+}
+
+/// Seed of the plan before a step: no two steps of an evaluation share one.
+fn plan_seed(variation: u64, step: u32) -> u64 {
+    (variation << 16) + u64::from(step)
+}
+
+impl Link {
+    async fn call<Q: Message, R: Message>(&self, key: OwnedKeyExpr, request: Q) -> Result<R, Error> {
+        query::call(&self.session, &key, request, self.timeout).await
+    }
+
+    async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
+        self.call(key::planner_plan(&self.planner)?, request).await
+    }
+
+    async fn register_goal(&self, goal: &Image) -> Result<String, Error> {
+        let request = RegisterGoalRequest { image: goal.clone() };
+        let response: RegisterGoalResponse = self.call(key::planner_register_goal(&self.planner)?, request).await?;
+        Ok(response.goal_id)
+    }
+}
+
+/// What the plans of an episode told about themselves.
+#[derive(Debug, Default)]
+struct Log {
+    steps: u32,
+    latent_distances: Vec<Option<f32>>,
+    first_inner_losses: Vec<Option<f32>>,
+    last_inner_losses: Vec<Option<f32>>,
+    times: StageTimes,
+}
+
+impl Log {
+    fn add(&mut self, plan: &PlanResponse) {
+        let finite = |value: f32| value.is_finite().then_some(value);
+        self.last_inner_losses = plan.inner_losses.iter().map(|&loss| finite(loss)).collect();
+        if self.steps == 0 {
+            self.first_inner_losses.clone_from(&self.last_inner_losses);
+        }
+        self.latent_distances.extend(plan.latent_distance.map(finite));
+        self.times.queue_seconds += plan.times.queue_seconds;
+        self.times.encode_seconds += plan.times.encode_seconds;
+        self.times.plan_seconds += plan.times.plan_seconds;
+        self.steps += 1;
+    }
+
+    fn finish(self, goal_id: String) -> record::Episode {
+        let mean = |sum: f64| sum / f64::from(self.steps);
+        record::Episode {
+            goal_id,
+            steps: self.steps,
+            latent_distances: self.latent_distances,
+            first_inner_losses: self.first_inner_losses,
+            last_inner_losses: self.last_inner_losses,
+            mean_times: StageTimes {
+                queue_seconds: mean(self.times.queue_seconds),
+                encode_seconds: mean(self.times.encode_seconds),
+                plan_seconds: mean(self.times.plan_seconds),
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test")]
+mod tests {
+    use super::*;
+    use service_kit::SessionConfig;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use zenoh::query::Query;
+
+    const DIGEST: &str = "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff";
+
+    fn image(shade: u8) -> Image {
+        Image::new(2, 2, vec![shade; 12]).unwrap()
+    }
+
+    async fn serve(session: &Session, key: OwnedKeyExpr, answer: impl Fn(&Query) + Send + Sync + 'static) {
+        session.declare_queryable(key).complete(true).callback(move |query| answer(&query)).background().await.unwrap();
+    }
+
+    /// A worker whose episodes are solved by the third step, and a planner that forgets each goal once.
+    async fn forgetful() -> (Link, Arc<AtomicUsize>) {
+        let session = service_kit::session::open(&SessionConfig::default()).await.unwrap();
+        serve(&session, key::sim_reset("w").unwrap(), |query| {
+            let variation = query::request::<ResetRequest>(query).unwrap().variation;
+            let result = match variation.seed {
+                13 => Err(Error::new(Code::FailedPrecondition, "variation.seed", "another", 13)),
+                _ if variation.task == "unknown" => Err(Error::invalid("variation.task", "a task", "unknown")),
+                _ => {
+                    Ok(ResetResponse { episode_id: "e".into(), goal: image(255), observation: image(0), max_steps: 5 })
+                }
+            };
+            query::reply(query, result).unwrap();
+        })
+        .await;
+        serve(&session, key::sim_step("w").unwrap(), |query| {
+            let step = query::request::<StepRequest>(query).unwrap().step;
+            let solved = step == 2;
+            let observation = image(step as u8 + 1);
+            query::reply(query, Ok(StepResponse { observation, reward: 0.0, success: solved, done: solved })).unwrap();
+        })
+        .await;
+        let registered = Arc::new(AtomicUsize::new(0));
+        let count = registered.clone();
+        serve(&session, key::planner_register_goal("p").unwrap(), move |query| {
+            count.fetch_add(1, Ordering::SeqCst);
+            let goal_id = query::request::<RegisterGoalRequest>(query).unwrap().image.digest();
+            query::reply(query, Ok(RegisterGoalResponse { goal_id })).unwrap();
+        })
+        .await;
+        let count = registered.clone();
+        serve(&session, key::planner_plan("p").unwrap(), move |query| {
+            let request = query::request::<PlanRequest>(query).unwrap();
+            let result = if count.load(Ordering::SeqCst) < 2 {
+                Err(Error::new(Code::NotFound, "goal_id", "a goal", "forgotten"))
+            } else {
+                Ok(PlanResponse {
+                    actions: vec![vec![0.0; 4]],
+                    first_action: vec![0.0; 4],
+                    inner_losses: vec![f32::NAN, request.seed as f32],
+                    latent_distance: Some(1.0),
+                    times: wire::planner::StageTimes { plan_seconds: 0.5, ..Default::default() },
+                    model_digest: DIGEST.into(),
+                    goal_id: image(255).digest(),
+                })
+            };
+            query::reply(query, result).unwrap();
+        })
+        .await;
+        (Link { session, planner: "p".into(), timeout: Duration::from_secs(10) }, registered)
+    }
+
+    fn model(digest: &str) -> Model {
+        let (name, method, digest) = ("cpn".into(), "cpn".into(), digest.into());
+        Model { name, method, digest, training_tasks: Vec::new(), horizon: 1 }
+    }
+
+    fn variation(task: &str, seed: u64) -> Variation {
+        Variation { task: task.into(), seed }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_forgotten_goal_is_registered_again_and_the_episode_recorded() {
+        let (link, registered) = forgetful().await;
+        let attempt = attempt(&link, "w", &model(DIGEST), &variation("reach", 1)).await.unwrap();
+        assert_eq!(registered.load(Ordering::SeqCst), 2);
+        assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
+        let episode = attempt.episode;
+        assert_eq!((episode.steps, episode.latent_distances), (3, vec![Some(1.0); 3]));
+        let seeds = [1 << 16, (1 << 16) + 2].map(|seed| seed as f32);
+        assert_eq!(episode.first_inner_losses, [None, Some(seeds[0])]);
+        assert_eq!(episode.last_inner_losses, [None, Some(seeds[1])]);
+        assert_eq!(episode.mean_times.plan_seconds, 0.5);
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn faults_are_told_apart() {
+        let (link, _) = forgetful().await;
+        let fault = async |worker: &str, digest: &str, variation: Variation| {
+            attempt(&link, worker, &model(digest), &variation).await.unwrap_err()
+        };
+        assert!(matches!(fault("w", DIGEST, variation("reach", 13)).await, Fault::NoGoalImage));
+        assert!(
+            matches!(fault("w", DIGEST, variation("unknown", 1)).await, Fault::Refused(e) if e.field == "variation.task")
+        );
+        assert!(
+            matches!(fault("nobody", DIGEST, variation("reach", 1)).await, Fault::Broken(e) if e.code == Code::Unavailable)
+        );
+        // The planner has swapped in another checkpoint.
+        let other = "0".repeat(64);
+        assert!(
+            matches!(fault("w", &other, variation("reach", 1)).await, Fault::Broken(e) if e.field == "model_digest")
+        );
+    }
+}
