@@ -19,5 +19,5 @@ trap 'kill $trainer 2>/dev/null || true; wait' EXIT
 # A run scales badly to a second thread, so there are two at a time. Without the setting glibc gives the large blocks of
 # every step back to the kernel, which costs a sixth of the time.
 export MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=4000000000
-printf '%s\n' cpn te-bc upn bc | xargs -P "$(nproc)" -I{} target/release/cpn-trainer train --threads 1 \
+printf '%s\n' cpn te-bc | xargs -P "$(nproc)" -I{} target/release/cpn-trainer train --threads 1 \
   --dataset "$dataset" --method {} --hold-out "$held_out" --out models/{}.safetensors

@@ -1,5 +1,7 @@
 //! Checkpoints come back as they were, and damaged ones are refused with the reason.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 mod common;
 
 use common::{noise_images, small_config};

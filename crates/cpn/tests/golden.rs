@@ -1,5 +1,7 @@
 //! The method against golden tensors of an independent PyTorch implementation, `tests/golden/reference.py`.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 mod common;
 
 use cpn::archive::{self, Tensors};

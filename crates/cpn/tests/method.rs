@@ -1,5 +1,7 @@
 //! The mathematics of the networks, the inner loop and the outer loop.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 mod common;
 
 use common::{double_agent, noise_images, small_config, uniform};

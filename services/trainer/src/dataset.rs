@@ -74,7 +74,7 @@ impl Dataset {
             ensure!(expected == got, "{}: expected {expected} action values, got {got}", episode.info.episode_id);
         }
         let index = self.episodes.len();
-        self.samples.extend((0..episode.len()).map(|step| Sample { episode: index, step }));
+        self.samples.extend((0..episode.action_count()).map(|step| Sample { episode: index, step }));
         self.episodes.push(episode);
         Ok(())
     }
@@ -122,7 +122,7 @@ impl Dataset {
         let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         for (row, sample) in samples.iter().enumerate() {
             let episode = &self.episodes[sample.episode];
-            let (row, step, length) = (row as i64, sample.step as i64, episode.len() as i64);
+            let (row, step, length) = (row as i64, sample.step as i64, episode.action_count() as i64);
             observations.push(episode.frames.get(step));
             goals.push(episode.frames.get(length));
             let known = horizon.min(length - step);

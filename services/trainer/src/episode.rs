@@ -74,7 +74,7 @@ impl Episode {
     }
 
     /// T, the number of actions.
-    pub fn len(&self) -> usize {
+    pub fn action_count(&self) -> usize {
         self.actions.size()[0] as usize
     }
 

@@ -1,5 +1,7 @@
 //! Demonstration streams over real zenoh sessions: nothing is lost, nothing is kept twice, nothing wrong is kept.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 mod common;
 
 use common::{commit, step};
@@ -54,7 +56,7 @@ async fn a_stream_with_losses_is_kept_whole_in_the_end() {
     assert!(send_commit(&worker, &request).await.unwrap().is_empty(), "an episode is kept once");
 
     let episode = Episode::read(&folder.path().join("data/door-lock/door-lock-3.safetensors")).unwrap();
-    assert_eq!((episode.len(), episode.info.task.as_str(), episode.info.seed), (5, "door-lock", 3));
+    assert_eq!((episode.action_count(), episode.info.task.as_str(), episode.info.seed), (5, "door-lock", 3));
     for number in 0..6u32 {
         let sent = step(&request, number);
         let frame = Vec::<u8>::try_from(episode.frames.get(number.into()).view(-1)).unwrap();
@@ -71,7 +73,8 @@ async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = start(folder.path(), "tcp/127.0.0.1:17452").await;
     let request = commit("reach", 1, 3);
-    let cases: [(&str, &dyn Fn(u32, &mut DemonstrationStep)); 4] = [
+    type Spoil<'a> = &'a dyn Fn(u32, &mut DemonstrationStep);
+    let cases: [(&str, Spoil<'_>); 4] = [
         ("steps[1].frame", &|number, step| {
             if number == 1 {
                 step.frame = Image::new(8, 8, vec![0; 192]).unwrap();

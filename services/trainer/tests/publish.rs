@@ -1,5 +1,7 @@
 //! A planner that is up, and one that comes later, serve what the trainer publishes.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 use cpn::checkpoint::{self, Provenance};
 use cpn::{Agent, MethodKind, ModelConfig};
 use service_kit::{SessionConfig, files};

@@ -1,5 +1,7 @@
 //! Training runs on a few small episodes.
 
+#![expect(clippy::unwrap_used, reason = "a test")]
+
 mod common;
 
 use common::{commit, keep};
