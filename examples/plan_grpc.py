@@ -1,6 +1,6 @@
 """Asks a planner over gRPC for a plan towards a registered picture.
 
-uv run --project sim-worker --extra grpc examples/plan_grpc.py examples/goal.png examples/frame.png
+sim-worker/.venv/bin/python examples/plan_grpc.py examples/goal.png examples/frame.png
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Asks a planner over zenoh for a plan towards a picture.
 
-uv run --project sim-worker examples/plan_zenoh.py examples/goal.png examples/frame.png
+sim-worker/.venv/bin/python examples/plan_zenoh.py examples/goal.png examples/frame.png
 """
 
 import sys
