@@ -6,12 +6,11 @@ cd "$(dirname "$0")/.."
 
 # Two tasks that no model has seen, one that it was trained on; see docs/decisions/0004-demonstration-tasks.md.
 tasks=door-lock,drawer-close,plate-slide
-out=${CPN_DEMO_OUT:-runs/demo}
-trials=${CPN_DEMO_TRIALS:-20}
+out=runs/demo
 export CPN_NAMESPACE=demo-$$
 endpoint=tcp/127.0.0.1:$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
 
-mkdir -p "$out"
+rm -rf "$out" && mkdir -p "$out"
 started=()
 stop() {
   trap - EXIT INT TERM
@@ -28,5 +27,5 @@ for worker in w0 w1; do
   started+=($!)
 done
 
-target/release/cpn-eval run --workers 2 --models cpn,te-bc,random --tasks "$tasks" --trials "$trials" \
+target/release/cpn-eval run --workers 2 --models cpn,te-bc,random --tasks "$tasks" --trials 20 \
   --connect "$endpoint" --out "$out"

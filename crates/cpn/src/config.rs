@@ -71,6 +71,16 @@ impl ConvConfig {
     }
 }
 
+/// A named encoder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EncoderPreset {
+    /// [`EncoderConfig::paper`].
+    Paper,
+    /// [`EncoderConfig::upn`].
+    Upn,
+}
+
 /// The image encoder f_φ.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -81,6 +91,15 @@ pub struct EncoderConfig {
     pub latent: i64,
     /// Whether the embedding is layer-normalised, which keeps the inner loss on one scale.
     pub layer_norm: bool,
+}
+
+impl From<EncoderPreset> for EncoderConfig {
+    fn from(preset: EncoderPreset) -> Self {
+        match preset {
+            EncoderPreset::Paper => Self::paper(),
+            EncoderPreset::Upn => Self::upn(),
+        }
+    }
 }
 
 impl EncoderConfig {

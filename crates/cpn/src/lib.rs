@@ -32,5 +32,5 @@ pub mod neuromodulated;
 pub mod planner;
 
 pub use agent::{Agent, Method, Random};
-pub use config::{EncoderConfig, MethodKind, ModelConfig};
+pub use config::{EncoderConfig, EncoderPreset, MethodKind, ModelConfig};
 pub use planner::Plan;

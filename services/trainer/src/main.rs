@@ -1,7 +1,6 @@
 //! `cpn-trainer`: the service that takes in demonstrations and publishes checkpoints, and the training run.
 
 use clap::{Args, Parser, Subcommand};
-use cpn::MethodKind;
 use serde::Serialize;
 use service_kit::{SessionConfig, config, shutdown, telemetry};
 use std::path::PathBuf;
@@ -55,10 +54,14 @@ struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// Method to train.
-    #[arg(long, value_parser = parse_method)]
+    /// Method to train: bc, te-bc, upn or cpn.
+    #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
-    method: Option<MethodKind>,
+    method: Option<String>,
+    /// Encoder to train it with: paper or upn.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    encoder: Option<String>,
     /// Tasks that the model must not see.
     #[arg(long, value_delimiter = ',')]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -79,13 +82,6 @@ struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     threads: Option<i32>,
-}
-
-fn parse_method(text: &str) -> Result<MethodKind, String> {
-    MethodKind::ALL
-        .into_iter()
-        .find(|method| method.name() == text)
-        .ok_or_else(|| format!("expected one of {}", MethodKind::ALL.map(MethodKind::name).join(", ")))
 }
 
 #[tokio::main]

@@ -5,7 +5,7 @@ use crate::dataset::Dataset;
 use anyhow::{Context, ensure};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, MethodKind, ModelConfig};
+use cpn::{Agent, EncoderPreset, MethodKind, ModelConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
@@ -27,6 +27,8 @@ pub struct Config {
     pub out: PathBuf,
     /// Method to train.
     pub method: MethodKind,
+    /// Encoder to train it with.
+    pub encoder: EncoderPreset,
     /// Tasks that the model must not see.
     pub hold_out: Vec<String>,
     /// Passes over every frame.
@@ -49,6 +51,7 @@ impl Default for Config {
             dataset: "data/demonstrations".into(),
             out: "runs/checkpoints/cpn.safetensors".into(),
             method: MethodKind::Cpn,
+            encoder: EncoderPreset::Paper,
             hold_out: Vec::new(),
             epochs: 5,
             batch_size: 128,
@@ -99,7 +102,12 @@ pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcom
     let tasks: Vec<String> = dataset.tasks().map(str::to_owned).collect();
     info!(tasks = tasks.len(), episodes = dataset.episode_count(), samples = dataset.sample_count(), "demonstrations");
 
-    let model = ModelConfig { actions: dataset.action_size(), ..ModelConfig::paper(config.method) };
+    let model = ModelConfig {
+        encoder: config.encoder.into(),
+        actions: dataset.action_size(),
+        ..ModelConfig::paper(config.method)
+    };
+    model.validate()?;
     let agent = Agent::new(model, config.seed);
     let mut adam = Adam::new(agent.variables());
     let resume_path = config.out.with_extension("resume");

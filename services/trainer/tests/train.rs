@@ -5,8 +5,7 @@
 mod common;
 
 use common::{commit, keep};
-use cpn::MethodKind;
-use cpn::checkpoint;
+use cpn::{EncoderConfig, EncoderPreset, MethodKind, checkpoint};
 use std::path::Path;
 use trainer::train::{self, Config, Outcome};
 
@@ -64,6 +63,15 @@ fn the_checkpoint_tells_where_it_comes_from() {
         assert_eq!((loaded.provenance.seed, loaded.provenance.epochs), (4, 1));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
     }
+}
+
+#[test]
+fn the_encoder_is_chosen_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = Config { encoder: EncoderPreset::Upn, method: MethodKind::Bc, ..config(folder.path(), "upn-encoder") };
+    finished(&config);
+    let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
+    assert_eq!(loaded.agent.config().encoder, EncoderConfig::upn());
 }
 
 /// Noise can be learnt by heart: the loss must fall far below that of a policy that knows nothing.
