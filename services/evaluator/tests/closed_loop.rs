@@ -24,7 +24,7 @@ const LIMIT: Duration = Duration::from_secs(240);
 /// A planner with an untrained model, and a place for workers.
 struct Lab {
     folder: TempDir,
-    planner: Planner,
+    planner: Option<Planner>,
     endpoint: String,
     namespace: String,
 }
@@ -46,7 +46,14 @@ impl Lab {
             SessionConfig { listen: vec![endpoint.clone()], namespace: Some(namespace.clone()), ..Default::default() };
         let grpc_listen = "127.0.0.1:0".parse().unwrap();
         let config = planner::Config { models_dir, grpc_listen, session, ..Default::default() };
-        Self { folder, planner: planner::start(config).await.unwrap(), endpoint, namespace }
+        Self { folder, planner: Some(planner::start(config).await.unwrap()), endpoint, namespace }
+    }
+
+    /// The planner goes away, unless it did before.
+    async fn stop_planner(&mut self) {
+        if let Some(planner) = self.planner.take() {
+            planner.shutdown().await.unwrap();
+        }
     }
 
     fn worker(&self, name: &str, max_steps: u32) -> Child {
@@ -117,7 +124,7 @@ fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn every_model_is_run_on_the_same_variations_and_reported() {
-    let lab = Lab::start().await;
+    let mut lab = Lab::start().await;
     let _workers = [lab.worker("w0", 12), lab.worker("w1", 12)];
     // The expert does not solve seed 2 of this task.
     let arguments = ["--workers", "2", "--tasks", "door-open", "--models", "cpn,random", "--trials", "2"];
@@ -153,15 +160,30 @@ async fn every_model_is_run_on_the_same_variations_and_reported() {
     assert_eq!((files(&out.join("trials")), files(&out.join("frames"))), (trials, frames));
     let summary: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
     assert_eq!(summary["rows"][1]["trials"], 2);
-    lab.planner.shutdown().await.unwrap();
+    lab.stop_planner().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_worker_leaves_errors_and_no_hang() {
-    let lab = Lab::start().await;
+    lose(Lost::Worker).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_planner_that_goes_leaves_errors_and_no_hang() {
+    lose(Lost::Planner).await;
+}
+
+enum Lost {
+    Worker,
+    Planner,
+}
+
+/// Loses a part in the middle of an evaluation.
+async fn lose(lost: Lost) {
+    let mut lab = Lab::start().await;
     let mut worker = lab.worker("w0", 150);
     let arguments = ["--tasks", "reach", "--models", "random,cpn", "--trials", "5", "--wait-secs", "120"];
-    // One trial, to know that all is well and to give up soon on the lost worker below.
+    // One trial, to know that all is well and to give up soon on what is lost below.
     let one = lab.evaluate(&[&arguments[..4], &["--trials", "1", "--wait-secs", "120"]].concat()).await;
     assert!(one.success);
 
@@ -175,7 +197,10 @@ async fn a_killed_worker_leaves_errors_and_no_hang() {
     })
     .await
     .expect("the first new trial ends");
-    worker.kill().await.unwrap();
+    match lost {
+        Lost::Worker => worker.kill().await.unwrap(),
+        Lost::Planner => lab.stop_planner().await,
+    }
 
     let ended = Ended::of(evaluation.wait_with_output()).await;
     assert!(!ended.success);
@@ -189,12 +214,12 @@ async fn a_killed_worker_leaves_errors_and_no_hang() {
     assert!((1..8).contains(&errors.len()), "{} errors", errors.len());
     assert!(errors.iter().all(|trial| !trial["message"].as_str().unwrap().is_empty()));
     assert!(ended.stdout.contains("reach, cpn: "), "the table says what went wrong");
-    lab.planner.shutdown().await.unwrap();
+    lab.stop_planner().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_cannot_be_evaluated_is_named() {
-    let lab = Lab::start().await;
+    let mut lab = Lab::start().await;
     let ended = lab.evaluate(&["--tasks", "reach", "--planner", "nobody", "--wait-secs", "1"]).await;
     assert!(!ended.success);
     assert!(ended.stderr.contains("after 1 s still without planner \"nobody\" and simulator workers (0 of 1 there)"));
@@ -208,5 +233,5 @@ async fn what_cannot_be_evaluated_is_named() {
     assert!(!ended.success);
     assert!(ended.stderr.contains("refused: variation.task: expected one of assembly, "));
     assert!(ended.stderr.contains("got 'reach-the-moon'"));
-    lab.planner.shutdown().await.unwrap();
+    lab.stop_planner().await;
 }
