@@ -1,28 +1,30 @@
 # One verb list. Every verb does its own set-up.
 
 SHELL := bash
-UV_CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn
-UV := $(UV_CACHE)/tools/bin/uv
+TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
+UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo models test lint format clean
+.PHONY: help setup system build demo models test lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-setup: .libtorch/build-version $(WORKER)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
+setup: system .libtorch/build-version $(WORKER)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
 
-.libtorch/build-version: scripts/setup-libtorch.sh
-	scripts/setup-libtorch.sh
+system:
+	@scripts/setup-system.sh
 
-$(UV):
-	python3 -m venv $(UV_CACHE)/tools
-	$(UV_CACHE)/tools/bin/pip install --quiet --disable-pip-version-check uv
+$(UV): | system
+	python3 -m venv $(TOOLS)
+	$(TOOLS)/bin/pip install --quiet --disable-pip-version-check uv
+
+.libtorch/build-version: scripts/setup-libtorch.sh | $(UV)
+	PATH="$(TOOLS)/bin:$$PATH" scripts/setup-libtorch.sh
 
 $(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/scripts/generate_proto.py $(wildcard proto/cpn/v1/*.proto) | $(UV)
-	scripts/setup-graphics.sh
 	cd sim-worker && $(UV) sync --quiet --locked --extra grpc && $(UV) run --quiet scripts/generate_proto.py
 	touch $@
 

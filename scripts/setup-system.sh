@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
-# Software OpenGL for headless rendering. Needs root only if the libraries are not there yet.
+# Debian packages that the rest builds on. Needs root only if something is missing.
 set -euo pipefail
 
-packages=(libegl1 libgl1-mesa-dri libopengl0)
 missing=()
-for package in "${packages[@]}"; do
+# Software OpenGL for headless rendering.
+for package in libegl1 libgl1-mesa-dri libopengl0; do
   dpkg-query --show --showformat='${Status}' "$package" 2>/dev/null | grep -q 'install ok installed' || missing+=("$package")
 done
+command -v c++ >/dev/null || missing+=(g++)                           # torch-sys compiles C++
+python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv) # Debian splits it off
 ((${#missing[@]})) || exit 0
 
 sudo=()
