@@ -21,6 +21,19 @@ pub struct EpisodeInfo {
     pub seed: u64,
 }
 
+/// Checks that a step's frame is of the one size that episodes have.
+///
+/// # Errors
+/// If it is not, naming the step.
+pub fn check_frame(DemonstrationStep { step, frame, .. }: &DemonstrationStep) -> Result<(), Error> {
+    let side = images::SIZE as u32;
+    if (frame.height(), frame.width()) == (side, side) {
+        return Ok(());
+    }
+    let got = format!("{} x {}", frame.height(), frame.width());
+    Err(Error::invalid(format!("steps[{step}].frame"), format!("{side} x {side}"), got))
+}
+
 /// T expert actions with the frames before, between and after them.
 #[derive(Debug)]
 pub struct Episode {
@@ -40,13 +53,9 @@ impl Episode {
     pub fn from_steps(commit: &CommitEpisodeRequest, steps: &[DemonstrationStep]) -> Result<Self, Error> {
         let (last, acting) = steps.split_last().ok_or_else(|| Error::invalid("steps", "at least 2", 0))?;
         let mut pixels = Vec::with_capacity(steps.len() * images::BYTES);
-        for DemonstrationStep { step, frame, .. } in steps {
-            let side = images::SIZE as u32;
-            if (frame.height(), frame.width()) != (side, side) {
-                let got = format!("{} x {}", frame.height(), frame.width());
-                return Err(Error::invalid(format!("steps[{step}].frame"), format!("{side} x {side}"), got));
-            }
-            pixels.extend_from_slice(frame.data());
+        for step in steps {
+            check_frame(step)?;
+            pixels.extend_from_slice(step.frame.data());
         }
         if last.action.is_some() {
             return Err(Error::invalid(format!("steps[{}].action", last.step), "none at the goal frame", "an action"));

@@ -4,7 +4,7 @@
 //! steps are still missing. An episode that is kept already answers that nothing is, so that a sender can always begin
 //! by committing, and a stream can be sent again without harm.
 
-use crate::episode::Episode;
+use crate::episode::{self, Episode};
 use lru::LruCache;
 use service_kit::files;
 use std::collections::BTreeMap;
@@ -19,14 +19,19 @@ use zenoh::Session;
 /// Episodes that may be under way at once; past that, the one that was silent longest is given up.
 const MAX_OPEN_EPISODES: NonZeroUsize = NonZeroUsize::new(64).expect("not zero");
 
-/// Steps by number.
-type Steps = BTreeMap<u32, DemonstrationStep>;
+/// An episode under way.
+#[derive(Debug, Default)]
+struct Open {
+    steps: BTreeMap<u32, DemonstrationStep>,
+    /// Why it can no longer be kept; the next commit is told.
+    fault: Option<Error>,
+}
 
 /// Episodes under way, and the folder of those that are kept.
 #[derive(Debug)]
 pub struct Ingest {
     folder: PathBuf,
-    open: Mutex<LruCache<String, Steps>>,
+    open: Mutex<LruCache<String, Open>>,
 }
 
 impl Ingest {
@@ -35,10 +40,15 @@ impl Ingest {
         Self { folder, open: Mutex::new(LruCache::new(MAX_OPEN_EPISODES)) }
     }
 
-    /// Takes in one step; a step that is there already is replaced.
+    /// Takes in one step; a step that is there already is replaced. A frame of another size is not held, which bounds
+    /// what a stranger's stream can take.
     pub fn step(&self, step: DemonstrationStep) {
         let mut open = self.open();
-        open.get_or_insert_mut(step.episode_id.clone(), Steps::new).insert(step.step, step);
+        let episode = open.get_or_insert_mut(step.episode_id.clone(), Open::default);
+        match episode::check_frame(&step) {
+            Ok(()) => drop(episode.steps.insert(step.step, step)),
+            Err(fault) => episode.fault = Some(fault),
+        }
     }
 
     /// Keeps an episode if every step is there, else answers which are missing.
@@ -53,14 +63,16 @@ impl Ingest {
         }
         let steps = {
             let mut open = self.open();
-            let missing_steps: Vec<u32> = match open.get(&request.episode_id) {
-                Some(steps) => (0..request.steps).filter(|step| !steps.contains_key(step)).collect(),
-                None => (0..request.steps).collect(),
-            };
+            let mut episode = open.pop(&request.episode_id).unwrap_or_default();
+            if let Some(fault) = episode.fault.take() {
+                return Err(fault);
+            }
+            let missing_steps: Vec<u32> = (0..request.steps).filter(|step| !episode.steps.contains_key(step)).collect();
             if !missing_steps.is_empty() {
+                open.put(request.episode_id.clone(), episode);
                 return Ok(CommitEpisodeResponse { missing_steps });
             }
-            open.pop(&request.episode_id).unwrap_or_default()
+            episode.steps
         };
         if let Some((&extra, _)) = steps.range(request.steps..).next() {
             return Err(Error::invalid("steps", format!("all steps below {}", request.steps), extra));
@@ -72,7 +84,7 @@ impl Ingest {
         Ok(CommitEpisodeResponse { missing_steps: Vec::new() })
     }
 
-    fn open(&self) -> MutexGuard<'_, LruCache<String, Steps>> {
+    fn open(&self) -> MutexGuard<'_, LruCache<String, Open>> {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
