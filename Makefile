@@ -34,7 +34,7 @@ build: setup ## Compile the services
 demo: build ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
 	scripts/demo.sh
 
-models: build ## Make the shipped checkpoints again: demonstrations, then training (about an hour on two cores)
+models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
 test: setup ## Everything that must pass

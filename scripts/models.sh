@@ -16,8 +16,8 @@ trainer=$!
 trap 'kill $trainer 2>/dev/null || true; wait' EXIT
 "$CPN_SIM_WORKER" demonstrate --episodes "$episodes" --processes "$(nproc)" --connect "$endpoint"
 
-# A run scales badly to a second thread, so there are two at a time. Without the setting glibc gives the large blocks of
-# every step back to the kernel, which costs a sixth of the time.
+# A run gains little from a second thread, so there is one run a core. Without the setting glibc gives the large blocks of
+# every step back to the kernel, and takes them anew at the next.
 export MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=4000000000
 printf '%s\n' cpn te-bc | xargs -P "$(nproc)" -I{} target/release/cpn-trainer train --threads 1 \
   --dataset "$dataset" --method {} --hold-out "$held_out" --out models/{}.safetensors
