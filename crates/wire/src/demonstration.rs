@@ -1,11 +1,16 @@
-//! The demonstration stream, from workers to the trainer.
+//! The demonstration stream, from workers to the trainer, and what a recorder holds of it.
 
-use crate::message::{action, name, required};
+use crate::message::{action, digest as checked_digest, finite, name, position, required};
 use crate::sim::Variation;
 use crate::{Error, Image, Message, proto};
+use sha2::{Digest, Sha256};
 
 /// Most steps of an episode.
 pub const MAX_STEPS: u32 = 1000;
+/// Most values of a state.
+const MAX_STATE: usize = 1024;
+/// Most actions in a second of simulated time.
+const MAX_CONTROL_HZ: f64 = 10_000.0;
 
 /// One numbered step of an episode.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,17 +23,36 @@ pub struct DemonstrationStep {
     pub frame: Image,
     /// What the expert did; none at the last step, whose frame is the goal.
     pub action: Option<Vec<f32>>,
+    /// What the simulator knows of itself before the action; the hand's x, y, z in metres come first. At most 1024.
+    pub state: Vec<f32>,
+    /// What the action before this step brought; 0 at the first.
+    pub reward: f32,
+    /// Whether the task is solved at this step.
+    pub success: bool,
 }
 
-/// Closes an episode.
+/// A whole episode, without its steps: as its sender commits it, and as a recorder tells that it holds it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct CommitEpisodeRequest {
+pub struct RecordedEpisode {
     /// The episode.
     pub episode_id: String,
     /// What was demonstrated.
     pub variation: Variation,
     /// Number of steps, goal frame included.
     pub steps: u32,
+    /// What [`digest`] gives for the steps.
+    pub digest: String,
+    /// Where the goal is: x, y, z in metres; empty if it is no position.
+    pub goal_position: Vec<f32>,
+    /// Actions per second of simulated time.
+    pub control_hz: f64,
+}
+
+/// Closes an episode.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommitEpisodeRequest {
+    /// What is to be kept once every step is there.
+    pub episode: RecordedEpisode,
 }
 
 /// What the receiver still lacks.
@@ -38,8 +62,38 @@ pub struct CommitEpisodeResponse {
     pub missing_steps: Vec<u32>,
 }
 
+/// SHA-256, in hex, over the steps in order, each as pixels, action, state and reward (little-endian 32-bit floats), and
+/// one byte that is 1 for success. A step without an action adds nothing for it.
+pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> String {
+    let mut hasher = Sha256::new();
+    for DemonstrationStep { frame, action, state, reward, success, .. } in steps {
+        hasher.update(frame.data());
+        for value in action.iter().flatten().chain(state).chain([reward]) {
+            hasher.update(value.to_le_bytes());
+        }
+        hasher.update([u8::from(*success)]);
+    }
+    hex::encode(hasher.finalize())
+}
+
 fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
     if (min..=max).contains(&value) { Ok(value) } else { Err(Error::invalid(field, format!("{min} to {max}"), value)) }
+}
+
+/// The checked action, state and reward of a step.
+pub(crate) fn motion(
+    raw_action: Option<proto::Action>,
+    state: Vec<f32>,
+    reward: f32,
+) -> Result<(Option<Vec<f32>>, Vec<f32>, f32), Error> {
+    let action = raw_action.map(action).transpose().map_err(|e| e.within("action"))?;
+    if state.len() > MAX_STATE {
+        return Err(Error::invalid("state", format!("at most {MAX_STATE} values"), state.len()));
+    }
+    if !reward.is_finite() {
+        return Err(Error::invalid("reward", "a finite number", reward));
+    }
+    Ok((action, finite("state", state)?, reward))
 }
 
 impl Message for DemonstrationStep {
@@ -50,23 +104,54 @@ impl TryFrom<proto::DemonstrationStep> for DemonstrationStep {
     type Error = Error;
 
     fn try_from(step: proto::DemonstrationStep) -> Result<Self, Error> {
+        let (action, state, reward) = motion(step.action, step.state, step.reward)?;
         Ok(Self {
             episode_id: name("episode_id", step.episode_id)?,
             step: step_count("step", step.step, 0, MAX_STEPS - 1)?,
             frame: required("frame", step.frame)?,
-            action: step.action.map(action).transpose().map_err(|e| e.within("action"))?,
+            action,
+            state,
+            reward,
+            success: step.success,
         })
     }
 }
 
 impl From<DemonstrationStep> for proto::DemonstrationStep {
     fn from(step: DemonstrationStep) -> Self {
-        Self {
-            episode_id: step.episode_id,
-            step: step.step,
-            frame: Some(step.frame.into()),
-            action: step.action.map(|values| proto::Action { values }),
+        let DemonstrationStep { episode_id, step, frame, action, state, reward, success } = step;
+        let action = action.map(|values| proto::Action { values });
+        Self { episode_id, step, frame: Some(frame.into()), action, state, reward, success }
+    }
+}
+
+impl Message for RecordedEpisode {
+    type Proto = proto::RecordedEpisode;
+}
+
+impl TryFrom<proto::RecordedEpisode> for RecordedEpisode {
+    type Error = Error;
+
+    fn try_from(episode: proto::RecordedEpisode) -> Result<Self, Error> {
+        let control_hz = episode.control_hz;
+        if !(control_hz > 0.0 && control_hz <= MAX_CONTROL_HZ) {
+            return Err(Error::invalid("control_hz", format!("above 0, at most {MAX_CONTROL_HZ}"), control_hz));
         }
+        Ok(Self {
+            episode_id: name("episode_id", episode.episode_id)?,
+            variation: required("variation", episode.variation)?,
+            steps: step_count("steps", episode.steps, 2, MAX_STEPS)?,
+            digest: checked_digest("digest", episode.digest)?,
+            goal_position: position("goal_position", episode.goal_position)?,
+            control_hz,
+        })
+    }
+}
+
+impl From<RecordedEpisode> for proto::RecordedEpisode {
+    fn from(episode: RecordedEpisode) -> Self {
+        let RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz } = episode;
+        Self { episode_id, variation: Some(variation.into()), steps, digest, goal_position, control_hz }
     }
 }
 
@@ -78,17 +163,17 @@ impl TryFrom<proto::CommitEpisodeRequest> for CommitEpisodeRequest {
     type Error = Error;
 
     fn try_from(request: proto::CommitEpisodeRequest) -> Result<Self, Error> {
-        Ok(Self {
-            episode_id: name("episode_id", request.episode_id)?,
-            variation: required("variation", request.variation)?,
-            steps: step_count("steps", request.steps, 2, MAX_STEPS)?,
-        })
+        let proto::CommitEpisodeRequest { episode_id, variation, steps, digest, goal_position, control_hz } = request;
+        let episode = proto::RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz };
+        Ok(Self { episode: episode.try_into()? })
     }
 }
 
 impl From<CommitEpisodeRequest> for proto::CommitEpisodeRequest {
     fn from(request: CommitEpisodeRequest) -> Self {
-        Self { episode_id: request.episode_id, variation: Some(request.variation.into()), steps: request.steps }
+        let proto::RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz } =
+            request.episode.into();
+        Self { episode_id, variation, steps, digest, goal_position, control_hz }
     }
 }
 

@@ -6,6 +6,8 @@ use std::fmt;
 
 /// Largest height and width, in pixels.
 const MAX_SIDE: u32 = 512;
+/// Longest render spec, in bytes.
+const MAX_RENDER_SPEC_BYTES: usize = 1024;
 
 /// An RGB8 image: rows from the top, red, green and blue interleaved.
 #[derive(Clone, PartialEq, Eq)]
@@ -13,10 +15,11 @@ pub struct Image {
     height: u32,
     width: u32,
     data: Vec<u8>,
+    render_spec: String,
 }
 
 impl Image {
-    /// An image of `height * width * 3` bytes.
+    /// A real camera's image of `height * width * 3` bytes.
     ///
     /// # Errors
     /// If a side is 0 or too large, or the data does not fit the sides.
@@ -30,7 +33,16 @@ impl Image {
         if data.len() != expected {
             return Err(Error::invalid("data", format!("{expected} bytes"), format!("{} bytes", data.len())));
         }
-        Ok(Self { height, width, data })
+        Ok(Self { height, width, data, render_spec: String::new() })
+    }
+
+    /// The same image as a simulator's: `spec` is its own JSON for how it was rendered, opaque here; empty for a real
+    /// camera's picture.
+    ///
+    /// # Errors
+    /// If the spec is longer than 1024 bytes.
+    pub fn rendered_as(self, spec: impl Into<String>) -> Result<Self, Error> {
+        Ok(Self { render_spec: render_spec("render_spec", spec.into())?, ..self })
     }
 
     /// Height in pixels.
@@ -48,14 +60,29 @@ impl Image {
         &self.data
     }
 
-    /// SHA-256 of shape, format and pixels, in hex: the id of a goal.
+    /// How it was rendered; empty for a real camera's picture.
+    pub fn render_spec(&self) -> &str {
+        &self.render_spec
+    }
+
+    /// SHA-256 of shape, format, pixels and render spec, in hex: the id of a goal.
     pub fn digest(&self) -> String {
         let mut hasher = Sha256::new();
         hasher.update(b"rgb8");
         hasher.update(self.height.to_le_bytes());
         hasher.update(self.width.to_le_bytes());
         hasher.update(&self.data);
+        hasher.update(&self.render_spec);
         hex::encode(hasher.finalize())
+    }
+}
+
+/// A render spec of bounded length.
+pub(crate) fn render_spec(field: &str, spec: String) -> Result<String, Error> {
+    if spec.len() <= MAX_RENDER_SPEC_BYTES {
+        Ok(spec)
+    } else {
+        Err(Error::invalid(field, format!("at most {MAX_RENDER_SPEC_BYTES} bytes"), format!("{} bytes", spec.len())))
     }
 }
 
@@ -74,13 +101,13 @@ impl TryFrom<proto::Image> for Image {
                 .map_or_else(|_| image.format.to_string(), |format| format.as_str_name().to_owned());
             return Err(Error::invalid("format", proto::PixelFormat::Rgb8.as_str_name(), got));
         }
-        Self::new(image.height, image.width, image.data)
+        Self::new(image.height, image.width, image.data)?.rendered_as(image.render_spec)
     }
 }
 
 impl From<Image> for proto::Image {
     fn from(image: Image) -> Self {
-        let Image { height, width, data } = image;
-        Self { height, width, format: proto::PixelFormat::Rgb8.into(), data }
+        let Image { height, width, data, render_spec } = image;
+        Self { height, width, format: proto::PixelFormat::Rgb8.into(), data, render_spec }
     }
 }

@@ -42,10 +42,12 @@ keys! {
     sim_frame(worker) = "cpn/@v1/sim/${worker:*}/frame";
     /// Published actions, for watchers.
     sim_action(worker) = "cpn/@v1/sim/${worker:*}/action";
-    /// Published [`crate::demonstration::DemonstrationStep`].
+    /// Published [`crate::demonstration::DemonstrationStep`]; queryable, without a payload, once the episode is recorded.
     demonstration_step(episode, step) = "cpn/@v1/demonstration/${episode:*}/step/${step:*}";
     /// Queryable: [`crate::demonstration::CommitEpisodeRequest`].
     demonstration_commit(episode) = "cpn/@v1/demonstration/${episode:*}/commit";
+    /// Published [`crate::demonstration::RecordedEpisode`]; queryable without a payload.
+    demonstration_recorded(episode) = "cpn/@v1/demonstration/${episode:*}/recorded";
     /// Published [`crate::checkpoint::CheckpointAnnouncement`].
     checkpoint_announcement(model) = "cpn/@v1/checkpoint/${model:*}/announcement";
     /// Queryable: [`crate::checkpoint::CheckpointChunkRequest`].
@@ -59,6 +61,11 @@ keys! {
 /// The worker's name in the key of its liveliness token.
 pub fn worker_of_sim_alive(key: &keyexpr) -> Option<String> {
     Some(format::sim_alive::parse(key).ok()?.worker().to_string())
+}
+
+/// The episode, or `*`, in the key of its steps.
+pub fn episode_of_demonstration_step(key: &keyexpr) -> Option<String> {
+    Some(format::demonstration_step::parse(key).ok()?.episode().to_string())
 }
 
 /// The digest in the key of a checkpoint's pieces.

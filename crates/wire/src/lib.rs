@@ -11,6 +11,7 @@ pub mod key;
 mod message;
 pub mod planner;
 pub mod query;
+pub mod recording;
 pub mod sim;
 
 pub use error::{Code, Error};
@@ -22,6 +23,7 @@ pub use message::{Message, decode, encode};
 pub mod proto {
     tonic::include_proto!("cpn.v1");
 
-    /// The encoded `FileDescriptorSet` of every message, for gRPC reflection.
+    /// The encoded `FileDescriptorSet` of every message, for gRPC reflection and the schemas of
+    /// recordings.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 }

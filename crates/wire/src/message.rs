@@ -3,6 +3,9 @@
 use crate::Error;
 use prost::Message as _;
 
+/// Most values of an action.
+const MAX_ACTION: usize = 64;
+
 /// A native type with a protobuf message; the conversion from the message checks every field.
 pub trait Message: TryFrom<Self::Proto, Error = Error> + Into<Self::Proto> {
     /// The generated type.
@@ -54,11 +57,27 @@ pub(crate) fn digest(field: &str, value: String) -> Result<String, Error> {
     }
 }
 
-/// An action: at least one value, all finite.
+/// An action: 1 to 64 values, all finite.
 pub(crate) fn action(action: crate::proto::Action) -> Result<Vec<f32>, Error> {
-    match action.values.iter().find(|v| !v.is_finite()) {
-        Some(value) => Err(Error::invalid("values", "finite numbers", value)),
-        None if action.values.is_empty() => Err(Error::invalid("values", "at least one number", "none")),
-        None => Ok(action.values),
+    if !(1..=MAX_ACTION).contains(&action.values.len()) {
+        return Err(Error::invalid("values", format!("1 to {MAX_ACTION} numbers"), action.values.len()));
+    }
+    finite("values", action.values)
+}
+
+/// Numbers that are all finite.
+pub(crate) fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, Error> {
+    match values.iter().find(|value| !value.is_finite()) {
+        Some(value) => Err(Error::invalid(field, "finite numbers", value)),
+        None => Ok(values),
+    }
+}
+
+/// A position x, y, z in metres, or none.
+pub(crate) fn position(field: &str, values: Vec<f32>) -> Result<Vec<f32>, Error> {
+    if [0, 3].contains(&values.len()) {
+        finite(field, values)
+    } else {
+        Err(Error::invalid(field, "0 or 3 values", values.len()))
     }
 }

@@ -4,8 +4,8 @@ use crate::{Code, Error, Message, decode, encode, proto};
 use prost::{Message as _, Name};
 use std::time::Duration;
 use zenoh::bytes::Encoding;
-use zenoh::key_expr::OwnedKeyExpr;
-use zenoh::query::{ConsolidationMode, Query};
+use zenoh::key_expr::{OwnedKeyExpr, keyexpr};
+use zenoh::query::{ConsolidationMode, Query, Reply};
 use zenoh::{Session, Wait};
 
 /// The encoding that marks a payload as message `N`.
@@ -37,6 +37,36 @@ pub async fn call<Q: Message, R: Message>(
     let Ok(reply) = replies.recv_async().await else {
         return Err(Error::new(Code::Unavailable, key.as_str(), "a service", "none connected"));
     };
+    decode_reply(reply, key, timeout)
+}
+
+/// Asks, without a payload, for everything at a key, and awaits every answer, in the order they come; several services
+/// may give the same one. Nothing is no error.
+///
+/// # Errors
+/// The first error that is answered; [`Code::DeadlineExceeded`] if the answers did not end in time;
+/// [`Code::ResourceExhausted`] if there are more than `limit`.
+pub async fn collect<R: Message>(
+    session: &Session,
+    key: &OwnedKeyExpr,
+    limit: usize,
+    timeout: Duration,
+) -> Result<Vec<R>, Error> {
+    let unavailable = |e: zenoh::Error| Error::new(Code::Unavailable, key.as_str(), "answers", e);
+    let replies =
+        session.get(key).consolidation(ConsolidationMode::None).timeout(timeout).await.map_err(unavailable)?;
+    let mut answers = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        if answers.len() == limit {
+            let expected = format!("at most {limit} answers");
+            return Err(Error::new(Code::ResourceExhausted, key.as_str(), expected, "more"));
+        }
+        answers.push(decode_reply(reply, key, timeout)?);
+    }
+    Ok(answers)
+}
+
+fn decode_reply<R: Message>(reply: Reply, key: &OwnedKeyExpr, timeout: Duration) -> Result<R, Error> {
     match reply.into_result() {
         Ok(sample) => decode(&sample.payload().to_bytes()),
         Err(error) if *error.encoding() == encoding::<proto::Error>() => {
@@ -68,9 +98,17 @@ pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
 /// If zenoh cannot send it.
 pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Result<()> {
     match result {
-        Ok(response) => query.reply(query.key_expr(), encode(response)).encoding(encoding::<R::Proto>()).wait(),
+        Ok(response) => reply_at(query, query.key_expr(), response),
         Err(error) => {
             query.reply_err(proto::Error::from(error).encode_to_vec()).encoding(encoding::<proto::Error>()).wait()
         }
     }
+}
+
+/// Adds one of several answers to a query: the value that is at `key`, which the query's key must match.
+///
+/// # Errors
+/// If zenoh cannot send it.
+pub fn reply_at<R: Message>(query: &Query, key: &keyexpr, response: R) -> zenoh::Result<()> {
+    query.reply(key, encode(response)).encoding(encoding::<R::Proto>()).wait()
 }

@@ -1,6 +1,6 @@
 //! Requests to a simulator worker and its answers.
 
-use crate::message::{action, required};
+use crate::message::{action, position, required};
 use crate::{Error, Image, Message, proto};
 
 /// The randomised object positions of an episode.
@@ -30,6 +30,8 @@ pub struct ResetResponse {
     pub observation: Image,
     /// The episode ends after this many steps at the latest.
     pub max_steps: u32,
+    /// Where the goal is: x, y, z in metres; empty if it is no position.
+    pub goal_position: Vec<f32>,
 }
 
 /// Applies one action, exactly once.
@@ -101,6 +103,7 @@ impl TryFrom<proto::ResetResponse> for ResetResponse {
             goal: required("goal", response.goal)?,
             observation: required("observation", response.observation)?,
             max_steps: response.max_steps,
+            goal_position: position("goal_position", response.goal_position)?,
         })
     }
 }
@@ -112,6 +115,7 @@ impl From<ResetResponse> for proto::ResetResponse {
             goal: Some(response.goal.into()),
             observation: Some(response.observation.into()),
             max_steps: response.max_steps,
+            goal_position: response.goal_position,
         }
     }
 }

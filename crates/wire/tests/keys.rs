@@ -20,6 +20,7 @@ fn keys_are_the_ones_agreed_upon() {
             "sim_alive" => key::sim_alive(&chunk("worker")),
             "demonstration_step" => key::demonstration_step(&chunk("episode"), &chunk("step")),
             "demonstration_commit" => key::demonstration_commit(&chunk("episode")),
+            "demonstration_recorded" => key::demonstration_recorded(&chunk("episode")),
             "planner_plan" => key::planner_plan(&chunk("planner")),
             "planner_register_goal" => key::planner_register_goal(&chunk("planner")),
             "planner_load_model" => key::planner_load_model(&chunk("planner")),
@@ -31,7 +32,7 @@ fn keys_are_the_ones_agreed_upon() {
         };
         assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
     }
-    assert_eq!(golden.len(), 14, "every key is in the file");
+    assert_eq!(golden.len(), 15, "every key is in the file");
 }
 
 #[test]
@@ -45,4 +46,11 @@ fn the_worker_is_read_from_its_token() {
     let key = key::sim_alive("w7").unwrap();
     assert_eq!(key::worker_of_sim_alive(&key).as_deref(), Some("w7"));
     assert_eq!(key::worker_of_sim_alive(&key::planner_alive("w7").unwrap()), None);
+}
+
+#[test]
+fn the_episode_is_read_from_the_key_of_its_steps() {
+    let key = key::demonstration_step("door-lock-17", "*").unwrap();
+    assert_eq!(key::episode_of_demonstration_step(&key).as_deref(), Some("door-lock-17"));
+    assert_eq!(key::episode_of_demonstration_step(&key::demonstration_commit("door-lock-17").unwrap()), None);
 }

@@ -3,13 +3,14 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use prost::Message as _;
+use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::sim::StepRequest;
 use wire::{Code, Error, decode, proto};
 
 fn black(side: u32) -> proto::Image {
     let format = proto::PixelFormat::Rgb8.into();
-    proto::Image { height: side, width: side, format, data: vec![0; (side * side * 3) as usize] }
+    proto::Image { height: side, width: side, format, data: vec![0; (side * side * 3) as usize], ..Default::default() }
 }
 
 fn plan_request() -> proto::PlanRequest {
@@ -35,7 +36,7 @@ fn the_unspoiled_request_is_fine() {
 
 #[test]
 fn each_wrong_field_is_named() {
-    let cases: [(Error, &str, &str, &str); 8] = [
+    let cases: [(Error, &str, &str, &str); 9] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -54,6 +55,12 @@ fn each_wrong_field_is_named() {
         (refusal(|r| r.observation.as_mut().unwrap().format = 77), "observation.format", "PIXEL_FORMAT_RGB8", "77"),
         (refusal(|r| r.observation.as_mut().unwrap().data.truncate(9)), "observation.data", "21168 bytes", "9 bytes"),
         (refusal(|r| r.observation.as_mut().unwrap().width = 0), "observation.width", "1 to 512 pixels", "0"),
+        (
+            refusal(|r| r.observation.as_mut().unwrap().render_spec = "x".repeat(1025)),
+            "observation.render_spec",
+            "at most 1024 bytes",
+            "1025 bytes",
+        ),
     ];
     for (error, field, expected, got) in cases {
         assert_eq!(error.code, Code::InvalidArgument);
@@ -82,6 +89,61 @@ fn an_action_that_is_not_a_number_is_refused() {
         proto::StepRequest { action: Some(proto::Action { values: vec![0.0, f32::NAN] }), ..Default::default() };
     let error = decode::<StepRequest>(&request.encode_to_vec()).unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("action.values", "NaN"));
+}
+
+#[test]
+fn each_wrong_field_of_a_commit_is_named() {
+    let good = || proto::CommitEpisodeRequest {
+        episode_id: "reach-1".into(),
+        variation: Some(proto::Variation { task: "reach".into(), seed: 1 }),
+        steps: 2,
+        digest: "0".repeat(64),
+        goal_position: Vec::new(),
+        control_hz: 10.0,
+    };
+    decode::<CommitEpisodeRequest>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::CommitEpisodeRequest);
+    let cases: [(Spoil, &str, &str); 8] = [
+        (|r| r.steps = 1, "steps", "1"),
+        (|r| r.digest = "ABC".into(), "digest", "\"ABC\""),
+        (|r| r.goal_position = vec![0.0; 2], "goal_position", "2"),
+        (|r| r.goal_position = vec![0.0, 0.0, f32::INFINITY], "goal_position", "inf"),
+        (|r| r.control_hz = 0.0, "control_hz", "0"),
+        (|r| r.control_hz = f64::NAN, "control_hz", "NaN"),
+        (|r| r.control_hz = 10_001.0, "control_hz", "10001"),
+        (|r| r.variation = None, "variation", "none"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut request = good();
+        spoil(&mut request);
+        let error = decode::<CommitEpisodeRequest>(&request.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_a_step_is_named() {
+    let good = || proto::DemonstrationStep {
+        episode_id: "reach-1".into(),
+        frame: Some(black(84)),
+        state: vec![0.0; 39],
+        ..Default::default()
+    };
+    decode::<DemonstrationStep>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::DemonstrationStep);
+    let cases: [(Spoil, &str, &str); 5] = [
+        (|s| s.step = 1000, "step", "1000"),
+        (|s| s.state = vec![0.0; 1025], "state", "1025"),
+        (|s| s.state[3] = f32::NAN, "state", "NaN"),
+        (|s| s.reward = f32::NEG_INFINITY, "reward", "-inf"),
+        (|s| s.action = Some(proto::Action { values: vec![0.0; 65] }), "action.values", "65"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut step = good();
+        spoil(&mut step);
+        let error = decode::<DemonstrationStep>(&step.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
 }
 
 #[test]

@@ -9,12 +9,14 @@ use std::time::Duration;
 use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
+use wire::recording::*;
 use wire::sim::*;
 use wire::{Image, Message, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
-    (1u32..6, 1u32..6).prop_flat_map(|(height, width)| {
-        vec(any::<u8>(), (height * width * 3) as usize).prop_map(move |data| Image::new(height, width, data).unwrap())
+    (1u32..6, 1u32..6, "\\PC{0,20}").prop_flat_map(|(height, width, spec)| {
+        vec(any::<u8>(), (height * width * 3) as usize)
+            .prop_map(move |data| Image::new(height, width, data).unwrap().rendered_as(spec.clone()).unwrap())
     })
 }
 
@@ -28,6 +30,23 @@ fn digest() -> &'static str {
 
 fn action() -> impl Strategy<Value = Vec<f32>> {
     vec(-1.0f32..1.0, 1..6)
+}
+
+fn position() -> impl Strategy<Value = Vec<f32>> {
+    prop_oneof![Just(Vec::new()), vec(-1.0f32..1.0, 3)]
+}
+
+fn recorded() -> impl Strategy<Value = RecordedEpisode> {
+    (name(), variation(), 2..=MAX_STEPS, digest(), position(), 0.1..100.0).prop_map(
+        |(episode_id, variation, steps, digest, goal_position, control_hz)| RecordedEpisode {
+            episode_id,
+            variation,
+            steps,
+            digest,
+            goal_position,
+            control_hz,
+        },
+    )
 }
 
 fn info() -> impl Strategy<Value = ModelInfo> {
@@ -101,27 +120,32 @@ proptest! {
         action in action(),
         reward in -9.0..9.0,
         (success, done) in any::<(bool, bool)>(),
+        goal_position in position(),
     ) {
         survives(ResetRequest { variation });
         survives(StepRequest { episode_id: episode_id.clone(), step, action });
         survives(StepResponse { observation: observation.clone(), reward, success, done });
-        survives(ResetResponse { episode_id, goal, observation, max_steps: step });
+        survives(ResetResponse { episode_id, goal, observation, max_steps: step, goal_position });
     }
 
     #[test]
     fn demonstrations_and_checkpoints(
-        variation in variation(),
-        episode_id in name(),
+        episode in recorded(),
         frame in image(),
         action in option::of(action()),
-        (step, steps) in (0..MAX_STEPS, 2..=MAX_STEPS),
+        (state, reward, success) in (vec(-9.0f32..9.0, 0..40), -9.0f32..9.0, any::<bool>()),
+        step in 0..MAX_STEPS,
         missing_steps in vec(any::<u32>(), 0..5),
         (model, digest, size_bytes) in (name(), digest(), any::<u64>()),
         (offset_bytes, length_bytes) in (any::<u64>(), 1..=MAX_CHUNK_BYTES),
         data in vec(any::<u8>(), 0..50),
     ) {
-        survives(DemonstrationStep { episode_id: episode_id.clone(), step, frame, action });
-        survives(CommitEpisodeRequest { episode_id, variation, steps });
+        let recorded = RecordedStep { step, action, state, reward, success };
+        survives(recorded.clone());
+        survives(EpisodeHeader { episode: episode.clone(), render_spec: frame.render_spec().into() });
+        survives(recorded.with_frame(episode.episode_id.clone(), frame));
+        survives(episode.clone());
+        survives(CommitEpisodeRequest { episode });
         survives(CommitEpisodeResponse { missing_steps });
         survives(CheckpointAnnouncement { model, digest, size_bytes });
         survives(CheckpointChunkRequest { offset_bytes, length_bytes });
@@ -135,5 +159,6 @@ proptest! {
         let _ = decode::<ResetResponse>(&bytes);
         let _ = decode::<DemonstrationStep>(&bytes);
         let _ = decode::<CommitEpisodeRequest>(&bytes);
+        let _ = decode::<EpisodeHeader>(&bytes);
     }
 }

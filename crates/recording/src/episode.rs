@@ -1,0 +1,91 @@
+//! Steps that make an episode.
+
+use wire::Error;
+use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
+use wire::recording::EpisodeHeader;
+
+/// T actions with the frames before, between and after them, and what is known of the whole. One that is built is right.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Episode {
+    info: RecordedEpisode,
+    steps: Vec<DemonstrationStep>,
+}
+
+impl Episode {
+    /// Puts the steps of a stream together. `steps` are in order and complete.
+    ///
+    /// # Errors
+    /// Names the step and field that does not fit: steps that are missing or of another episode, frames of several sizes
+    /// or render specs, an action that is missing, too many, of another width or not in [-1, 1], states of several
+    /// widths, or steps whose digest is not that of `info`.
+    pub fn new(info: RecordedEpisode, steps: Vec<DemonstrationStep>) -> Result<Self, Error> {
+        check("steps", info.steps as usize, steps.len())?;
+        let [first, .., last] = &steps[..] else {
+            return Err(Error::invalid("steps", "at least 2", steps.len()));
+        };
+        for (number, step) in (0..).zip(&steps) {
+            let fits = || {
+                check("step", number, step.step)?;
+                check("episode_id", &info.episode_id, &step.episode_id)?;
+                check("frame", size(first), size(step))?;
+                check("frame.render_spec", first.frame.render_spec(), step.frame.render_spec())?;
+                check("state", values(&first.state), values(&step.state))?;
+                check_action(step, number == last.step, first.action.as_ref().map_or(0, Vec::len))
+            };
+            fits().map_err(|e| e.within(&format!("steps[{number}]")))?;
+        }
+        check("digest", &info.digest, &digest(&steps))?;
+        Ok(Self { info, steps })
+    }
+
+    /// What its sender committed.
+    pub fn info(&self) -> &RecordedEpisode {
+        &self.info
+    }
+
+    /// The steps in order, at least 2.
+    pub fn steps(&self) -> &[DemonstrationStep] {
+        &self.steps
+    }
+
+    /// The steps in order, at least 2.
+    pub fn into_steps(self) -> Vec<DemonstrationStep> {
+        self.steps
+    }
+
+    /// How every frame was rendered; empty for those of a real camera.
+    pub fn render_spec(&self) -> &str {
+        self.steps[0].frame.render_spec()
+    }
+
+    /// What is known of it besides the steps.
+    pub fn header(&self) -> EpisodeHeader {
+        EpisodeHeader { episode: self.info.clone(), render_spec: self.render_spec().to_owned() }
+    }
+}
+
+fn check<T: PartialEq + ToString>(field: &str, expected: T, got: T) -> Result<(), Error> {
+    if expected == got { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
+}
+
+fn check_action(step: &DemonstrationStep, is_last: bool, width: usize) -> Result<(), Error> {
+    let Some(action) = &step.action else {
+        return if is_last { Ok(()) } else { Err(Error::invalid("action", "an action", "none")) };
+    };
+    if is_last {
+        return Err(Error::invalid("action", "none at the goal frame", "an action"));
+    }
+    check("action", format!("{width} values"), values(action))?;
+    match action.iter().find(|value| value.abs() > 1.0) {
+        Some(value) => Err(Error::invalid("action", "values in [-1, 1]", value)),
+        None => Ok(()),
+    }
+}
+
+fn size(step: &DemonstrationStep) -> String {
+    format!("{} x {}", step.frame.height(), step.frame.width())
+}
+
+fn values(values: &[f32]) -> String {
+    format!("{} values", values.len())
+}
