@@ -1,6 +1,8 @@
+import json
 import subprocess
 from collections import defaultdict
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +11,15 @@ import zenoh
 from cpn.v1 import demonstration_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.demonstrate import DemonstrateConfig
+from cpn_sim_worker.scene import Transition
 from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.stream import digest
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
 from cpn_sim_worker.wire import action_from_proto, decode, encoding, image_from_proto
 from tests.support import COMMAND, UNSOLVED
 
 Step = demonstration_pb2.DemonstrationStep
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Trainer:
@@ -26,7 +31,10 @@ class Trainer:
         self.received: list[tuple[str, int]] = []
         self.refuse = False
         self._subscriber = session.declare_subscriber(keys.demonstration_step("*", "*"), self._receive)
-        self._queryable = session.declare_queryable(keys.demonstration_commit("*"), self._commit, complete=True)
+        self._queryables = [
+            session.declare_queryable(keys.demonstration_commit("*"), self._commit, complete=True),
+            session.declare_queryable(keys.demonstration_recorded("*"), self._recorded, complete=True),
+        ]
 
     def _receive(self, sample: zenoh.Sample) -> None:
         step = decode(Step, sample.payload.to_bytes())
@@ -50,9 +58,17 @@ class Trainer:
             response = demonstration_pb2.CommitEpisodeResponse(missing_steps=missing)
             query.reply(keys.demonstration_commit(request.episode_id), response.SerializeToString())
 
+    def _recorded(self, query: zenoh.Query) -> None:
+        with query:
+            episode_id = str(query.key_expr).split("/")[-2]
+            if episode_id in self.kept:
+                recorded = demonstration_pb2.RecordedEpisode(episode_id=episode_id)
+                query.reply(keys.demonstration_recorded(episode_id), recorded.SerializeToString())
+
     def close(self) -> None:
         self._subscriber.undeclare()
-        self._queryable.undeclare()
+        for queryable in self._queryables:
+            queryable.undeclare()
 
 
 @pytest.fixture
@@ -78,18 +94,38 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
 
     request = trainer.kept["reach-5"]
     assert request.variation == types_pb2.Variation(task="reach", seed=5)
-    assert trainer.received.count(("reach-5", 3)) == 2
-    simulator.reset("reach", 5)
-    for number in range(request.steps):
-        step = trainer.steps["reach-5"][number]
+    assert trainer.received.count(("reach-5", 3)) > 1
+    steps = [trainer.steps["reach-5"][number] for number in range(request.steps)]
+    assert request.digest == digest(steps)
+    arrival = Transition(simulator.reset("reach", 5), reward=0, success=False)
+    for number, step in enumerate(steps):
         assert np.array_equal(image_from_proto(step.frame, "frame"), simulator.frame())
+        assert step.frame.render_spec == str(simulator.render_spec)
+        assert np.array_equal(step.state, arrival.state.astype(np.float32))
+        assert (step.reward, step.success) == (np.float32(arrival.reward), arrival.success)
         assert step.HasField("action") == (number < request.steps - 1)
         if step.HasField("action"):
-            simulator.step(action_from_proto(step.action, "action"))
+            arrival = simulator.step(action_from_proto(step.action, 4, "action"))
+    assert steps[-1].success
 
     trainer.received.clear()
     assert demonstrate(endpoint, *options).returncode == 0
     assert trainer.received == []
+
+
+def test_digest_is_the_same_in_every_language() -> None:
+    golden = json.loads((ROOT / "tests/golden/episode_digest.json").read_text())
+    steps = [
+        Step(
+            frame=types_pb2.Image(data=bytes((7 * i + 13 * n) % 256 for i in range(84 * 84 * 3))),
+            action=types_pb2.Action(values=[0.5, -0.25, n, 1.0]) if n < 2 else None,
+            state=[n + 0.5, -1.0],
+            reward=n * 0.125,
+            success=n == 2,
+        )
+        for n in range(3)
+    ]
+    assert digest(steps) == golden["digest"]
 
 
 def test_failed_expert_runs_are_rejected_and_counted(trainer: Trainer, endpoint: str) -> None:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from cpn.v1 import sim_pb2, types_pb2
+from cpn_sim_worker.render_spec import RenderSpec
 from cpn_sim_worker.spaces import IMAGE_SIZE
 from cpn_sim_worker.wire import (
     MAX_PAYLOAD_BYTES,
@@ -14,16 +15,19 @@ from cpn_sim_worker.wire import (
 )
 
 GENERATOR = np.random.default_rng(0)
+SPEC = RenderSpec("front", "rows", 84, 84, True, False, False, 0, None, (4, 28, 16), {"mujoco": "3.3.0"})
 
 
 def test_image_round_trip() -> None:
     pixels = GENERATOR.integers(0, 256, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-    assert np.array_equal(image_from_proto(image_to_proto(pixels), "goal"), pixels)
+    image = image_to_proto(pixels, SPEC)
+    assert np.array_equal(image_from_proto(image, "goal"), pixels)
+    assert image.render_spec == str(SPEC)
 
 
 def test_action_round_trip() -> None:
     action = GENERATOR.uniform(-1, 1, 4).astype(np.float32)
-    assert np.array_equal(action_from_proto(action_to_proto(action), "action"), action)
+    assert np.array_equal(action_from_proto(action_to_proto(action), 4, "action"), action)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +40,7 @@ def test_action_round_trip() -> None:
     ],
 )
 def test_image_at_fault_is_named(change: dict[str, int | bytes], field: str, got: str) -> None:
-    image = image_to_proto(np.zeros((IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8))
+    image = image_to_proto(np.zeros((IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8), SPEC)
     for name, value in change.items():
         setattr(image, name, value)
     with pytest.raises(RequestError) as caught:
@@ -49,7 +53,7 @@ def test_image_at_fault_is_named(change: dict[str, int | bytes], field: str, got
 )
 def test_action_at_fault_is_named(values: list[float]) -> None:
     with pytest.raises(RequestError) as caught:
-        action_from_proto(types_pb2.Action(values=values), "action")
+        action_from_proto(types_pb2.Action(values=values), 4, "action")
     assert caught.value.field == "action.values"
     assert caught.value.code == types_pb2.ERROR_CODE_INVALID_ARGUMENT
 

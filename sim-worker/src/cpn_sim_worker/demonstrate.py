@@ -1,34 +1,25 @@
 """Streams expert demonstrations to the trainer."""
 
 import multiprocessing
+import os
 import queue
 import signal
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 
-import numpy as np
 import zenoh
-from numpy.typing import NDArray
-from tenacity import retry, retry_if_exception, stop_after_delay, wait_exponential
 from tqdm import tqdm
 
 from cpn.v1 import demonstration_pb2, types_pb2
-from cpn_sim_worker import keys
-from cpn_sim_worker.expert import ExpertFailedError, run_expert
+from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.session import UnavailableError, ZenohConfig, ask, open_session
+from cpn_sim_worker.session import UnavailableError, ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.stream import EpisodeLostError, digest, is_recorded, send_episode
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, check_task
-from cpn_sim_worker.wire import RequestError, action_to_proto, encoding, image_to_proto
-
-COMMIT_TIMEOUT_SECONDS = 5.0
-TRAINER_PATIENCE_SECONDS = 120.0
-"""How long the trainer may be away before a demonstration gives up."""
-MAX_COMMITS = 10
-"""Commits of one episode after which its steps are taken to be lost for good."""
+from cpn_sim_worker.wire import RequestError, action_to_proto, image_to_proto
 
 
 @dataclass(frozen=True)
@@ -43,7 +34,7 @@ class DemonstrateConfig:
     """Successful episodes per task."""
     first_seed: int = 0
     """Seed of the first try. Each failure of the expert moves on to the next seed."""
-    processes: int = 1
+    processes: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
     """Processes that share the tasks."""
     zenoh: ZenohConfig = field(default_factory=ZenohConfig)
 
@@ -66,34 +57,8 @@ class Try:
     """False if the expert failed."""
 
 
-class EpisodeLostError(Exception):
-    """The trainer kept missing steps however often they were sent."""
-
-
-def _may_pass(error: BaseException) -> bool:
-    if isinstance(error, RequestError):
-        return error.code in (types_pb2.ERROR_CODE_UNAVAILABLE, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED)
-    return isinstance(error, UnavailableError)
-
-
-@retry(
-    retry=retry_if_exception(_may_pass),
-    wait=wait_exponential(multiplier=0.1, max=5),
-    stop=stop_after_delay(TRAINER_PATIENCE_SECONDS),
-    reraise=True,
-)
-def _commit(session: zenoh.Session, request: demonstration_pb2.CommitEpisodeRequest) -> Collection[int]:
-    """The steps that the trainer misses."""
-    key = keys.demonstration_commit(request.episode_id)
-    response = ask(session, key, request, demonstration_pb2.CommitEpisodeResponse, COMMIT_TIMEOUT_SECONDS)
-    return set(response.missing_steps)
-
-
-def send_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: int) -> None:
-    """Solves a variation and sends it, until the trainer has kept it.
-
-    The commit comes first: the trainer answers which steps it misses, and only for those is anything rendered. So
-    the first transmission, the repetition of lost steps and the resumption of an interrupted run are one path.
+def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: int) -> None:
+    """Solves a variation and sends it, unless the trainer holds it already.
 
     Raises:
         ExpertFailedError: If the expert does not solve the variation.
@@ -101,58 +66,48 @@ def send_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: 
         RequestError: If the trainer refuses the episode.
         UnavailableError: If the trainer stays away.
     """
-    actions = run_expert(simulator, task, seed)
-    request = demonstration_pb2.CommitEpisodeRequest(
-        episode_id=f"{task}-{seed}",
+    episode_id = f"{task}-{seed}"
+    if is_recorded(session, episode_id):
+        return
+    steps = [
+        demonstration_pb2.DemonstrationStep(
+            episode_id=episode_id,
+            step=number,
+            frame=image_to_proto(simulator.frame(), simulator.render_spec),
+            action=None if moment.action is None else action_to_proto(moment.action),
+            state=moment.arrival.state,
+            reward=moment.arrival.reward,
+            success=moment.arrival.success,
+        )
+        for number, moment in enumerate(solve(simulator, task, seed))
+    ]
+    commit = demonstration_pb2.CommitEpisodeRequest(
+        episode_id=episode_id,
         variation=types_pb2.Variation(task=task, seed=seed),
-        steps=len(actions) + 1,
+        steps=len(steps),
+        digest=digest(steps),
+        goal_position=simulator.scene.goal_position,
+        control_hz=simulator.scene.control_hz,
     )
-    for _ in range(MAX_COMMITS):
-        missing = _commit(session, request)
-        if not missing:
-            return
-        simulator.reset(task, seed)
-        for step in _replay(simulator, request.episode_id, actions, missing):
-            session.put(
-                keys.demonstration_step(request.episode_id, step.step),
-                step.SerializeToString(),
-                encoding=encoding(demonstration_pb2.DemonstrationStep),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-    raise EpisodeLostError(f"{request.episode_id}: the trainer still misses steps after {MAX_COMMITS} commits")
+    send_episode(session, steps, commit)
 
 
-def _replay(
-    simulator: Simulator, episode_id: str, actions: NDArray[np.float32], wanted: Collection[int]
-) -> Iterator[demonstration_pb2.DemonstrationStep]:
-    """Applies `actions`, [T, 4], from a fresh reset on and renders the wanted ones of the T + 1 steps."""
-    for step in range(len(actions) + 1):
-        action = actions[step] if step < len(actions) else None
-        if step in wanted:
-            yield demonstration_pb2.DemonstrationStep(
-                episode_id=episode_id,
-                step=step,
-                frame=image_to_proto(simulator.frame()),
-                action=None if action is None else action_to_proto(action),
-            )
-        if action is not None:
-            simulator.step(action)
-
-
-def _run_tasks(config: DemonstrateConfig, tasks: tuple[str, ...], tries: "multiprocessing.Queue[Try]") -> None:
-    """What one process does: all episodes of some tasks."""
+def _run_tasks(
+    config: DemonstrateConfig, tasks: "multiprocessing.Queue[str | None]", tries: "multiprocessing.Queue[Try]"
+) -> None:
+    """What one process does: all episodes of a task, then of the next, until it is handed None."""
     # An interrupt from the terminal reaches every process; the parent's is the one to act.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     simulator = Simulator(Renderer())
     try:
         with open_session(config.zenoh) as session:
-            for task in tasks:
+            for task in iter(tasks.get, None):
                 kept, seed = 0, config.first_seed
                 while kept < config.episodes:
                     if seed >= FIRST_EVALUATION_SEED:
                         sys.exit(f"{task}: no demonstration seeds are left")
                     try:
-                        send_episode(session, simulator, task, seed)
+                        demonstrate_episode(session, simulator, task, seed)
                         kept += 1
                         tries.put(Try(task, kept=True))
                     except ExpertFailedError:
@@ -166,11 +121,14 @@ def demonstrate(config: DemonstrateConfig) -> None:
     """Streams the demonstrations of every task and prints what became of the tries."""
     # Spawned, not forked: neither a GL context nor a zenoh session survives a fork.
     context = multiprocessing.get_context("spawn")
+    tasks: multiprocessing.Queue[str | None] = context.Queue()
     tries: multiprocessing.Queue[Try] = context.Queue()
     processes: list[BaseProcess] = [
-        context.Process(target=_run_tasks, args=(config, config.tasks[i :: config.processes], tries), daemon=True)
-        for i in range(min(config.processes, len(config.tasks)))
+        context.Process(target=_run_tasks, args=(config, tasks, tries), daemon=True)
+        for _ in range(min(config.processes, len(config.tasks)))
     ]
+    for task in (*config.tasks, *(None for _ in processes)):
+        tasks.put(task)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit("interrupted; run the same command again to resume"))
     for process in processes:

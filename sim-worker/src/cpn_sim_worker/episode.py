@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpn.v1 import sim_pb2, types_pb2
-from cpn_sim_worker.expert import ExpertFailedError, run_expert
+from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.simulator import Simulator
-from cpn_sim_worker.tasks import TASKS
+from cpn_sim_worker.tasks import UnknownTaskError, check_task
 from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto, invalid
 
 
@@ -41,11 +41,14 @@ class EpisodeRunner:
     def reset(self, request: sim_pb2.ResetRequest) -> sim_pb2.ResetResponse:
         """Ends the running episode and starts one of the requested variation."""
         task, seed = request.variation.task, request.variation.seed
-        if task not in TASKS:
-            raise invalid("variation.task", f"one of {', '.join(TASKS)}", repr(task))
+        try:
+            check_task(task)
+        except UnknownTaskError as error:
+            raise invalid("variation.task", error.expected, repr(task)) from None
         self.abandon()
         try:
-            run_expert(self._simulator, task, seed)
+            for _ in solve(self._simulator, task, seed):
+                pass
         except ExpertFailedError as error:
             raise RequestError(
                 types_pb2.ERROR_CODE_FAILED_PRECONDITION,
@@ -53,14 +56,15 @@ class EpisodeRunner:
                 "a seed whose variation the scripted expert solves, for the goal image",
                 error.seed,
             ) from None
-        goal = self._simulator.frame()
+        goal = self._frame()
         self._simulator.reset(task, seed)
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
         return sim_pb2.ResetResponse(
             episode_id=self._episode.id,
-            goal=image_to_proto(goal),
-            observation=image_to_proto(self._simulator.frame()),
+            goal=goal,
+            observation=self._frame(),
             max_steps=self._max_steps,
+            goal_position=self._simulator.scene.goal_position.tolist(),
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
@@ -69,7 +73,7 @@ class EpisodeRunner:
         if episode is None or request.episode_id != episode.id:
             running = "an episode started by a reset" if episode is None else repr(episode.id)
             raise RequestError(types_pb2.ERROR_CODE_NOT_FOUND, "episode_id", running, repr(request.episode_id))
-        action = action_from_proto(request.action, "action")
+        action = action_from_proto(request.action, self._simulator.scene.action_size, "action")
         latest = episode.latest
         if latest is not None and request.step == episode.steps - 1 and np.array_equal(action, latest.action):
             return latest.response, False
@@ -87,7 +91,7 @@ class EpisodeRunner:
         episode.success |= transition.success
         episode.done = episode.success or episode.steps >= self._max_steps
         response = sim_pb2.StepResponse(
-            observation=image_to_proto(self._simulator.frame()),
+            observation=self._frame(),
             reward=transition.reward,
             success=episode.success,
             done=episode.done,
@@ -98,3 +102,6 @@ class EpisodeRunner:
     def abandon(self) -> None:
         """Ends the running episode, if any: further steps of it are refused."""
         self._episode = None
+
+    def _frame(self) -> types_pb2.Image:
+        return image_to_proto(self._simulator.frame(), self._simulator.render_spec)

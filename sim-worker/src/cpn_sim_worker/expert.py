@@ -1,11 +1,12 @@
-"""Meta-World's scripted experts."""
+"""Episodes of the scripted experts."""
 
-import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
-from metaworld.policies import ENV_POLICY_MAP
 from numpy.typing import NDArray
 
+from cpn_sim_worker.scene import Transition
 from cpn_sim_worker.simulator import Simulator
 
 MAX_EXPERT_STEPS = 200
@@ -26,32 +27,35 @@ class ExpertFailedError(Exception):
         self.seed = seed
 
 
-def run_expert(simulator: Simulator, task: str, seed: int) -> NDArray[np.float32]:
-    """Solves a variation and leaves `simulator` in its goal state; returns the actions applied, [T, 4] in [-1, 1].
+@dataclass(frozen=True)
+class Moment:
+    """A step of an episode, before its action."""
 
-    Nothing is rendered. Physics is deterministic: `reset` and these actions lead through the same states again.
+    arrival: Transition
+    """The state, and what the action before brought; a reward of 0 at the first step."""
+    action: NDArray[np.float32] | None
+    """What the expert does next, [A] in [-1, 1]; None at the end."""
+
+
+def solve(simulator: Simulator, task: str, seed: int) -> Iterator[Moment]:
+    """Solves a variation, and lets the caller look at `simulator` before every action and at the end.
 
     Raises:
         ExpertFailedError: If the task is not solved in time, or not at rest.
     """
-    state = simulator.reset(task, seed)
-    policy = ENV_POLICY_MAP[f"{task}-v3"]()
-    actions: list[NDArray[np.float32]] = []
+    arrival = Transition(simulator.reset(task, seed), reward=0, success=False)
+    action = np.empty(0, np.float32)
     for _ in range(MAX_EXPERT_STEPS):
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Constant.s. may be too high")
-            action = np.clip(policy.get_action(state), -1, 1).astype(np.float32)
-        transition = simulator.step(action)
-        actions.append(action)
-        if transition.success:
+        action = simulator.scene.expert(arrival.state)
+        yield Moment(arrival, action)
+        arrival = simulator.step(action)
+        if arrival.success:
             break
-        state = transition.state
-    else:
-        raise ExpertFailedError(task, seed)
-    hold = np.array([0, 0, 0, action[3]], np.float32)
+    # The hand rests, the gripper keeps its grip.
+    hold = np.append(np.zeros(3, np.float32), action[3:])
     for _ in range(HOLD_STEPS):
-        transition = simulator.step(hold)
-        actions.append(hold)
-    if not transition.success:
+        yield Moment(arrival, hold)
+        arrival = simulator.step(hold)
+    if not arrival.success:
         raise ExpertFailedError(task, seed)
-    return np.stack(actions)
+    yield Moment(arrival, None)

@@ -42,6 +42,11 @@ def demonstration_commit(episode: str) -> str:
     return f"{ROOT}/demonstration/{episode}/commit"
 
 
+def demonstration_recorded(episode: str) -> str:
+    """Put, and queryable, of the trainer: `RecordedEpisode`."""
+    return f"{ROOT}/demonstration/{episode}/recorded"
+
+
 def planner_plan(planner: str) -> str:
     """Queryable: `PlanRequest` to `PlanResponse`."""
     return f"{ROOT}/planner/{planner}/plan"

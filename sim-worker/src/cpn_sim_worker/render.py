@@ -1,8 +1,10 @@
-"""Camera images of a MuJoCo scene."""
+"""Camera images of a scene."""
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
 
+import copy
+from importlib.metadata import version
 from typing import ClassVar
 
 import mujoco
@@ -10,27 +12,36 @@ import numpy as np
 from mujoco.gl_context import GLContext
 from numpy.typing import NDArray
 
+from cpn_sim_worker.meshes import decimated
+from cpn_sim_worker.render_spec import RenderSpec
+from cpn_sim_worker.scene import Scene
 from cpn_sim_worker.spaces import IMAGE_SIZE
-
-CAMERA = "corner4"
-"""The close pose, in which 84 pixels still resolve a handle."""
 
 MAX_GEOMS = 1000
 
+MAX_MESH_FACES = 1000
+"""At which no task's picture is less than 0.97 alike (SSIM) to the undecimated one; `make bench-sim` measures it."""
+
+TESSELLATION = (2, 16, 8)
+"""Half of MuJoCo's own quads, slices and stacks: no more than rounding at this size."""
+
 
 class Renderer:
-    """Draws one model at a time; call it from one thread only.
+    """Draws one scene at a time; call it from one thread only.
 
     Each `mujoco.Renderer` brings a GL context, and a second one in a process returns stale or garbage frames without
     an error. So here one GL context lives as long as the process, and a new model replaces the resources of the one
     before in that same context.
+
+    What is drawn is a lighter copy of the scene's model; the physics never sees it.
     """
 
     _exists: ClassVar[bool] = False
 
-    def __init__(self) -> None:
+    def __init__(self, max_mesh_faces: int | None = MAX_MESH_FACES) -> None:
         if Renderer._exists:
             raise RuntimeError("a process can hold one Renderer only: a second one would return garbage frames")
+        self._max_mesh_faces = max_mesh_faces
         self._gl = GLContext(IMAGE_SIZE, IMAGE_SIZE)
         Renderer._exists = True
         self._gl.make_current()
@@ -40,32 +51,55 @@ class Renderer:
         self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._model: mujoco.MjModel | None = None
+        self._scene: Scene | None = None
         self._context: mujoco.MjrContext | None = None
 
-    def _load(self, model: mujoco.MjModel) -> mujoco.MjrContext:
+    def spec(self, scene: Scene) -> RenderSpec:
+        """How `render` draws a scene."""
+        packages = ("mujoco", *scene.libraries) + (("fast-simplification",) if self._max_mesh_faces else ())
+        return RenderSpec(
+            camera=scene.camera.name,
+            flip=scene.camera.flip,
+            height=IMAGE_SIZE,
+            width=IMAGE_SIZE,
+            hidden_sites=True,
+            shadows=False,
+            reflections=False,
+            multisamples=0,
+            max_mesh_faces=self._max_mesh_faces,
+            tessellation=TESSELLATION,
+            versions={package: version(package) for package in packages},
+        )
+
+    def _load(self, scene: Scene) -> mujoco.MjrContext:
         if self._context is not None:
             self._context.free()
+        faces = self._max_mesh_faces
+        model = copy.copy(scene.model) if faces is None else decimated(scene.model, faces)
         # Shadows, reflections and multisampling are nine tenths of the time in a software renderer.
-        model.vis.quality.offsamples = 0
-        model.vis.quality.shadowsize = 0
+        quality = model.vis.quality
+        quality.offsamples = quality.shadowsize = 0
+        quality.numquads, quality.numslices, quality.numstacks = TESSELLATION
         model.vis.global_.offwidth = model.vis.global_.offheight = IMAGE_SIZE
-        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._camera.fixedcamid = model.camera(CAMERA).id
+        self._drawing = mujoco.MjvScene(model, MAX_GEOMS)
+        self._drawing.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._drawing.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._camera.fixedcamid = model.camera(scene.camera.name).id
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._model = model
+        self._scene = scene
         return self._context
 
-    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """The scene as the camera sees it: [84, 84, 3], RGB, rows from the top."""
-        context = self._context if self._context is not None and model is self._model else self._load(model)
-        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        mujoco.mjr_render(self._viewport, self._scene, context)
+    def render(self, scene: Scene) -> NDArray[np.uint8]:
+        """The scene as its camera sees it: [84, 84, 3], RGB, rows from the top, not mirrored."""
+        context = self._context if self._context is not None and scene is self._scene else self._load(scene)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, scene.data, self._option, None, self._camera, everything, self._drawing)
+        mujoco.mjr_render(self._viewport, self._drawing, context)
         pixels = np.empty((IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._viewport, context)
-        # GL's rows run from the bottom, and Meta-World hangs this camera upside down: the two cancel out for the
-        # rows, while the columns still run from right to left.
-        return np.ascontiguousarray(pixels[:, ::-1])
+        # GL's rows run from the bottom. Of a camera that hangs upside down the rows come right by that, while its
+        # columns run from right to left.
+        flipped = pixels[::-1] if scene.camera.flip == "rows" else pixels[:, ::-1]
+        return np.ascontiguousarray(flipped)

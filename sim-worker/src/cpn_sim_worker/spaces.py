@@ -1,7 +1,4 @@
-"""Sizes of what a policy sees and does."""
+"""Sizes of what a policy sees."""
 
 IMAGE_SIZE = 84
 """Height and width of every image, in pixels."""
-
-ACTION_SIZE = 4
-"""Hand displacement x, y, z and gripper effort, each in [-1, 1]; a displacement of 1 is 1 cm."""

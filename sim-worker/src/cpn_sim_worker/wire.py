@@ -7,7 +7,8 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from cpn.v1 import types_pb2
-from cpn_sim_worker.spaces import ACTION_SIZE, IMAGE_SIZE
+from cpn_sim_worker.render_spec import RenderSpec
+from cpn_sim_worker.spaces import IMAGE_SIZE
 
 MAX_PAYLOAD_BYTES = 1 << 20
 """Far above every message of the project but a whole checkpoint, which no worker receives."""
@@ -64,10 +65,16 @@ def decode(message_type: type[M], payload: bytes) -> M:
     return message
 
 
-def image_to_proto(pixels: NDArray[np.uint8]) -> types_pb2.Image:
-    """An image, [84, 84, 3], as a message."""
+def image_to_proto(pixels: NDArray[np.uint8], spec: RenderSpec) -> types_pb2.Image:
+    """An image, [84, 84, 3], and how it was rendered, as a message."""
     height, width, _ = pixels.shape
-    return types_pb2.Image(height=height, width=width, format=types_pb2.PIXEL_FORMAT_RGB8, data=pixels.tobytes())
+    return types_pb2.Image(
+        height=height,
+        width=width,
+        format=types_pb2.PIXEL_FORMAT_RGB8,
+        data=pixels.tobytes(),
+        render_spec=str(spec),
+    )
 
 
 def image_from_proto(image: types_pb2.Image, field: str) -> NDArray[np.uint8]:
@@ -83,14 +90,14 @@ def image_from_proto(image: types_pb2.Image, field: str) -> NDArray[np.uint8]:
 
 
 def action_to_proto(action: NDArray[np.float32]) -> types_pb2.Action:
-    """An action, [4], as a message."""
+    """An action, [A], as a message."""
     return types_pb2.Action(values=action.tolist())
 
 
-def action_from_proto(action: types_pb2.Action, field: str) -> NDArray[np.float32]:
-    """An action, [4] in [-1, 1], from its message; `field` names it in a `RequestError`."""
-    if len(action.values) != ACTION_SIZE:
-        raise invalid(f"{field}.values", f"{ACTION_SIZE} values", len(action.values))
+def action_from_proto(action: types_pb2.Action, size: int, field: str) -> NDArray[np.float32]:
+    """An action, [size] in [-1, 1], from its message; `field` names it in a `RequestError`."""
+    if len(action.values) != size:
+        raise invalid(f"{field}.values", f"{size} values", len(action.values))
     values = np.array(action.values, np.float32)
     # Written so that NaN, which compares false with everything, is refused too.
     if not np.all(np.abs(values) <= 1):

@@ -1,0 +1,89 @@
+"""The demonstration stream: sends an episode until the trainer has kept it."""
+
+import hashlib
+from collections.abc import Collection, Sequence
+
+import numpy as np
+import zenoh
+from tenacity import retry, retry_if_exception, stop_after_delay, wait_exponential
+
+from cpn.v1 import demonstration_pb2, types_pb2
+from cpn_sim_worker import keys
+from cpn_sim_worker.session import UnavailableError, ask
+from cpn_sim_worker.wire import RequestError, encoding
+
+COMMIT_TIMEOUT_SECONDS = 5.0
+TRAINER_PATIENCE_SECONDS = 120.0
+"""How long the trainer may be away before a demonstration gives up."""
+MAX_COMMITS = 10
+"""Commits of one episode after which its steps are taken to be lost for good."""
+LOOKUP_TIMEOUT_SECONDS = 2.0
+
+
+class EpisodeLostError(Exception):
+    """The trainer kept missing steps however often they were sent."""
+
+
+def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
+    """SHA-256 over the steps of an episode, in hex, as `CommitEpisodeRequest.digest` defines it."""
+    hasher = hashlib.sha256()
+    for step in steps:
+        hasher.update(step.frame.data)
+        for values in (step.action.values, step.state, [step.reward]):
+            hasher.update(np.array(values, "<f4").tobytes())
+        hasher.update(bytes([step.success]))
+    return hasher.hexdigest()
+
+
+def is_recorded(session: zenoh.Session, episode_id: str) -> bool:
+    """Whether a recorder that is up holds the episode."""
+    replies = session.get(keys.demonstration_recorded(episode_id), timeout=LOOKUP_TIMEOUT_SECONDS)
+    return any(reply.ok is not None for reply in replies)
+
+
+def send_episode(
+    session: zenoh.Session,
+    steps: Sequence[demonstration_pb2.DemonstrationStep],
+    commit: demonstration_pb2.CommitEpisodeRequest,
+) -> None:
+    """Sends the steps and commits them, again as long as the trainer misses some.
+
+    A trainer that is slow holds up the sender; one that is away is waited for.
+
+    Raises:
+        EpisodeLostError: If steps stay missing.
+        RequestError: If the trainer refuses the episode.
+        UnavailableError: If the trainer stays away.
+    """
+    missing: Collection[int] = range(len(steps))
+    for _ in range(MAX_COMMITS):
+        for number in missing:
+            session.put(
+                keys.demonstration_step(commit.episode_id, number),
+                steps[number].SerializeToString(),
+                encoding=encoding(demonstration_pb2.DemonstrationStep),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        missing = _commit(session, commit)
+        if not missing:
+            return
+    raise EpisodeLostError(f"{commit.episode_id}: the trainer still misses steps after {MAX_COMMITS} commits")
+
+
+def _may_pass(error: BaseException) -> bool:
+    if isinstance(error, RequestError):
+        return error.code in (types_pb2.ERROR_CODE_UNAVAILABLE, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED)
+    return isinstance(error, UnavailableError)
+
+
+@retry(
+    retry=retry_if_exception(_may_pass),
+    wait=wait_exponential(multiplier=0.1, max=5),
+    stop=stop_after_delay(TRAINER_PATIENCE_SECONDS),
+    reraise=True,
+)
+def _commit(session: zenoh.Session, request: demonstration_pb2.CommitEpisodeRequest) -> Collection[int]:
+    """The steps that the trainer misses."""
+    key = keys.demonstration_commit(request.episode_id)
+    response = ask(session, key, request, demonstration_pb2.CommitEpisodeResponse, COMMIT_TIMEOUT_SECONDS)
+    return response.missing_steps
