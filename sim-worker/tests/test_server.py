@@ -28,8 +28,8 @@ class Worker:
         self.session = session
         self.name = name
 
-    def reset(self, task: str = "reach", seed: int = SEED) -> sim_pb2.ResetResponse:
-        request = sim_pb2.ResetRequest(variation=types_pb2.Variation(task=task, seed=seed))
+    def reset(self, task: str = "reach", seed: int = SEED, goal_seed: int | None = None) -> sim_pb2.ResetResponse:
+        request = sim_pb2.ResetRequest(variation=types_pb2.Variation(task=task, seed=seed), goal_seed=goal_seed)
         return ask(self.session, keys.sim_reset(self.name), request, sim_pb2.ResetResponse, READY_SECONDS)
 
     def step(self, episode_id: str, step: int, values: tuple[float, ...] = REST) -> sim_pb2.StepResponse:
@@ -71,6 +71,16 @@ def test_reset_is_reproducible_and_ends_the_episode_before(worker: Worker) -> No
         worker.step(first.episode_id, 0)
     assert second.episode_id in caught.value.expected
     assert first.episode_id in caught.value.got
+
+
+def test_goal_of_another_variation(worker: Worker) -> None:
+    here, there = worker.reset(seed=SEED), worker.reset(seed=SEED + 1)
+    mixed = worker.reset(seed=SEED, goal_seed=SEED + 1)
+    assert (mixed.observation, mixed.goal) == (here.observation, there.goal)
+    assert here.goal != there.goal
+    task, unsolved = UNSOLVED
+    with pytest.raises(RequestError, match=r"FAILED_PRECONDITION goal_seed"):
+        worker.reset(task, unsolved + 1, goal_seed=unsolved)
 
 
 def test_step_is_applied_exactly_once(worker: Worker) -> None:

@@ -17,6 +17,8 @@ pub struct Variation {
 pub struct ResetRequest {
     /// Which one.
     pub variation: Variation,
+    /// Seed of the variation whose goal is shown, if not its own: an ablation.
+    pub goal_seed: Option<u64>,
 }
 
 /// A started episode.
@@ -80,13 +82,13 @@ impl TryFrom<proto::ResetRequest> for ResetRequest {
     type Error = Error;
 
     fn try_from(request: proto::ResetRequest) -> Result<Self, Error> {
-        Ok(Self { variation: required("variation", request.variation)? })
+        Ok(Self { variation: required("variation", request.variation)?, goal_seed: request.goal_seed })
     }
 }
 
 impl From<ResetRequest> for proto::ResetRequest {
     fn from(request: ResetRequest) -> Self {
-        Self { variation: Some(request.variation.into()) }
+        Self { variation: Some(request.variation.into()), goal_seed: request.goal_seed }
     }
 }
 

@@ -122,7 +122,7 @@ proptest! {
         (success, done) in any::<(bool, bool)>(),
         goal_position in position(),
     ) {
-        survives(ResetRequest { variation });
+        survives(ResetRequest { variation, goal_seed: success.then_some(u64::from(step)) });
         survives(StepRequest { episode_id: episode_id.clone(), step, action });
         survives(StepResponse { observation: observation.clone(), reward, success, done });
         survives(ResetResponse { episode_id, goal, observation, max_steps: step, goal_position });

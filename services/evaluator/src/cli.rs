@@ -1,5 +1,6 @@
 //! The command line.
 
+use crate::record::GoalSource;
 use clap::{Args, Parser, Subcommand, value_parser};
 use service_kit::SessionConfig;
 use std::path::PathBuf;
@@ -43,6 +44,9 @@ pub struct RunArgs {
     /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations.
     #[arg(long, default_value_t = 1_000_000, value_parser = value_parser!(u64).range(..1 << 47))]
     pub first_seed: u64,
+    /// Whose end the goal picture shows. Another variation's is an ablation, and the report says so.
+    #[arg(long, value_enum, default_value_t = GoalSource::SameVariation)]
+    pub goal: GoalSource,
     /// Folder of the records and the report.
     #[arg(long)]
     pub out: PathBuf,

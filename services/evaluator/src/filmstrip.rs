@@ -107,7 +107,7 @@ fn png(image: &Image) -> anyhow::Result<Vec<u8>> {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
-    use crate::record::{Episode, StageTimes};
+    use crate::record::{Episode, GoalSource, StageTimes};
 
     fn attempt(seed: u64, digest: &str, outcome: Outcome) -> (Trial, Attempt) {
         let episode = Episode {
@@ -124,6 +124,7 @@ mod tests {
             seed,
             model: "cpn".into(),
             model_digest: digest.repeat(64),
+            goal: GoalSource::SameVariation,
             outcome: outcome.clone(),
             episode: Some(episode.clone()),
         };

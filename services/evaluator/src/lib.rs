@@ -19,7 +19,7 @@ mod table;
 mod trial;
 
 pub use cli::{Cli, Command, ReportArgs, RunArgs};
-pub use record::{Episode, FORMAT, Folder, Model, Outcome, Run, StageTimes, Trial};
+pub use record::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
 pub use summary::{Row, Summary, Training};
 pub use table::table;
 
@@ -59,6 +59,7 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
         tasks: args.tasks.clone(),
         trials: args.trials,
         first_seed: args.first_seed,
+        goal: args.goal,
     };
     let folder = Folder::new(&args.out);
     folder.write_run(&run)?;

@@ -116,7 +116,7 @@ impl Queue {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
-    use crate::record::{FORMAT, Model};
+    use crate::record::{FORMAT, GoalSource, Model};
 
     fn variation(task: &str, seed: u64) -> Variation {
         Variation { task: task.into(), seed }
@@ -140,6 +140,7 @@ mod tests {
             tasks: tasks.iter().map(ToString::to_string).collect(),
             trials,
             first_seed: 10,
+            goal: GoalSource::SameVariation,
         }
     }
 

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use wire::planner::ModelInfo;
 
 /// Version of the files; another one is refused.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// What was compared, and how.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -34,6 +34,18 @@ pub struct Run {
     pub trials: u32,
     /// Seed of the first variation.
     pub first_seed: u64,
+    /// Where the goals come from.
+    pub goal: GoalSource,
+}
+
+/// Which variation's end the goal shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum GoalSource {
+    /// That of the variation to be solved.
+    SameVariation,
+    /// That of the next seed's, an ablation: what a method can do with a picture of the task but not of this scene.
+    OtherVariation,
 }
 
 /// A model as the planner served it.
@@ -71,6 +83,8 @@ pub struct Trial {
     pub model: String,
     /// SHA-256 of its checkpoint, in hex.
     pub model_digest: String,
+    /// Where the goal came from.
+    pub goal: GoalSource,
     /// How it ended.
     #[serde(flatten)]
     pub outcome: Outcome,
@@ -189,7 +203,7 @@ impl Folder {
                     let trial: Trial = read_json(&path)?;
                     let format = trial.format;
                     ensure!(format == FORMAT, "{}: expected format {FORMAT}, got {format}", path.display());
-                    if trial.model_digest == model.digest {
+                    if trial.model_digest == model.digest && trial.goal == run.goal {
                         by_seed.entry(*seed).or_default().push(trial);
                     }
                 }

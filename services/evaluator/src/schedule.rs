@@ -99,7 +99,8 @@ impl Schedule {
             self.at.insert(worker.clone(), job.variation.task.clone());
             let (run, link, worker) = (self.run.clone(), self.link.clone(), worker.clone());
             self.running.spawn(async move {
-                let result = trial::attempt(&link, &worker, &run.models[job.model], &job.variation).await;
+                let model = &run.models[job.model];
+                let result = trial::attempt(&link, &worker, model, &job.variation, run.goal).await;
                 if matches!(result, Err(Fault::Broken(_))) {
                     tokio::time::sleep(PAUSE).await;
                 }
@@ -148,6 +149,7 @@ impl Schedule {
             seed: job.variation.seed,
             model: model.name.clone(),
             model_digest: model.digest.clone(),
+            goal: self.run.goal,
             outcome,
             episode: attempt.map(|attempt| attempt.episode.clone()),
         };

@@ -1,5 +1,6 @@
 //! The summary in a terminal.
 
+use crate::record::GoalSource;
 use crate::summary::{Row, Summary};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
 
@@ -20,7 +21,11 @@ pub fn table(summary: &Summary) -> String {
         let count = if row.errors == 1 { "1 error".into() } else { format!("{} errors, the first", row.errors) };
         Some(format!("\n{}, {}: {count}: {error}", row.task, row.model))
     });
-    format!("{table}{}", errors.collect::<String>())
+    let ablation = match summary.run.goal {
+        GoalSource::SameVariation => "",
+        GoalSource::OtherVariation => "\nablation: the goal shows the end of another variation",
+    };
+    format!("{table}{ablation}{}", errors.collect::<String>())
 }
 
 fn cells(row: &Row) -> [String; 8] {

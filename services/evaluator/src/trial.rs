@@ -1,6 +1,6 @@
 //! One first attempt: closes the loop between a simulator worker and the planner.
 
-use crate::record::{self, Model, Outcome, StageTimes};
+use crate::record::{self, GoalSource, Model, Outcome, StageTimes};
 use std::time::Duration;
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
@@ -43,7 +43,9 @@ pub(crate) enum Fault {
 impl From<Error> for Fault {
     fn from(error: Error) -> Self {
         match error.code {
-            Code::FailedPrecondition if error.field == "variation.seed" => Self::NoGoalImage,
+            Code::FailedPrecondition if ["variation.seed", "goal_seed"].contains(&error.field.as_str()) => {
+                Self::NoGoalImage
+            }
             Code::InvalidArgument => Self::Refused(error),
             _ => Self::Broken(error),
         }
@@ -51,8 +53,18 @@ impl From<Error> for Fault {
 }
 
 /// Runs one episode: plans anew at each step and applies the first action (model predictive control).
-pub(crate) async fn attempt(link: &Link, worker: &str, model: &Model, variation: &Variation) -> Result<Attempt, Fault> {
-    let reset = ResetRequest { variation: variation.clone() };
+pub(crate) async fn attempt(
+    link: &Link,
+    worker: &str,
+    model: &Model,
+    variation: &Variation,
+    goal: GoalSource,
+) -> Result<Attempt, Fault> {
+    let goal_seed = match goal {
+        GoalSource::SameVariation => None,
+        GoalSource::OtherVariation => Some(variation.seed + 1),
+    };
+    let reset = ResetRequest { variation: variation.clone(), goal_seed };
     let reset: ResetResponse = link.call(key::sim_reset(worker)?, reset).await?;
     let mut goal_id = link.register_goal(&reset.goal).await?;
     let step_key = key::sim_step(worker)?;
@@ -175,9 +187,9 @@ mod tests {
     async fn forgetful() -> (Link, Arc<AtomicUsize>) {
         let session = service_kit::session::open(&SessionConfig::default()).await.unwrap();
         serve(&session, key::sim_reset("w").unwrap(), |query| {
-            let variation = query::request::<ResetRequest>(query).unwrap().variation;
-            let result = match variation.seed {
-                13 => Err(Error::new(Code::FailedPrecondition, "variation.seed", "another", 13)),
+            let ResetRequest { variation, goal_seed } = query::request::<ResetRequest>(query).unwrap();
+            let result = match goal_seed.unwrap_or(variation.seed) {
+                13 => Err(Error::new(Code::FailedPrecondition, "goal_seed", "another", 13)),
                 _ if variation.task == "unknown" => Err(Error::invalid("variation.task", "a task", "unknown")),
                 _ => {
                     Ok(ResetResponse { episode_id: "e".into(), goal: image(255), observation: image(0), max_steps: 5 })
@@ -235,7 +247,8 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn a_forgotten_goal_is_registered_again_and_the_episode_recorded() {
         let (link, registered) = forgetful().await;
-        let attempt = attempt(&link, "w", &model(DIGEST), &variation("reach", 1)).await.unwrap();
+        let goal = GoalSource::SameVariation;
+        let attempt = attempt(&link, "w", &model(DIGEST), &variation("reach", 1), goal).await.unwrap();
         assert_eq!(registered.load(Ordering::SeqCst), 2);
         assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
         let episode = attempt.episode;
@@ -250,8 +263,12 @@ mod tests {
     async fn faults_are_told_apart() {
         let (link, _) = forgetful().await;
         let fault = async |worker: &str, digest: &str, variation: Variation| {
-            attempt(&link, worker, &model(digest), &variation).await.unwrap_err()
+            attempt(&link, worker, &model(digest), &variation, GoalSource::SameVariation).await.unwrap_err()
         };
+        // The expert solves seed 12, but not the one after, whose goal is to be shown.
+        let goal = GoalSource::OtherVariation;
+        let other = attempt(&link, "w", &model(DIGEST), &variation("reach", 12), goal).await;
+        assert!(matches!(other, Err(Fault::NoGoalImage)));
         assert!(matches!(fault("w", DIGEST, variation("reach", 13)).await, Fault::NoGoalImage));
         assert!(
             matches!(fault("w", DIGEST, variation("unknown", 1)).await, Fault::Refused(e) if e.field == "variation.task")

@@ -2,7 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
-use evaluator::{Episode, FORMAT, Folder, Model, Outcome, Run, StageTimes, Trial};
+use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
 
 fn model(name: &str, digest: &str, training_tasks: &[&str]) -> Model {
     Model {
@@ -25,6 +25,7 @@ fn run() -> Run {
         tasks: vec!["door-lock".into(), "drawer-close".into()],
         trials: 4,
         first_seed: 10,
+        goal: GoalSource::SameVariation,
     }
 }
 
@@ -38,7 +39,8 @@ fn trial(task: &str, model: &Model, seed: u64, outcome: Outcome, steps: u32) -> 
         mean_times: StageTimes::default(),
     };
     let (task, model, model_digest) = (task.into(), model.name.clone(), model.digest.clone());
-    Trial { format: FORMAT, task, seed, model, model_digest, outcome, episode: Some(episode) }
+    let goal = GoalSource::SameVariation;
+    Trial { format: FORMAT, task, seed, model, model_digest, goal, outcome, episode: Some(episode) }
 }
 
 /// Seed 12 of door-lock has no goal image; one trial of drawer-close was never brought to an end.
@@ -93,6 +95,19 @@ fn records_of_another_checkpoint_or_beyond_the_last_seed_do_not_count() {
 }
 
 #[test]
+fn an_ablation_of_the_goal_says_so_and_counts_no_other_trials() {
+    let (root, folder) = folder();
+    folder.write_run(&Run { goal: GoalSource::OtherVariation, ..run() }).unwrap();
+    let own = trial("door-lock", &run().models[0], 10, Outcome::Success, 40);
+    folder.write_trial(&Trial { goal: GoalSource::OtherVariation, ..own }).unwrap();
+    let summary = evaluator::report(root.path()).unwrap();
+    assert_eq!(summary.rows.iter().map(|row| row.trials).collect::<Vec<_>>(), [1, 0, 0, 0]);
+    assert!(evaluator::table(&summary).ends_with("ablation: the goal shows the end of another variation"));
+    let html = std::fs::read_to_string(folder.path("report.html")).unwrap();
+    assert!(html.contains("Ablation: the picture shows the end of another variation"));
+}
+
+#[test]
 fn the_page_needs_nothing_else_and_escapes_what_it_shows() {
     let (root, folder) = folder();
     evaluator::report(root.path()).unwrap();
@@ -116,5 +131,5 @@ fn a_record_of_another_format_is_refused() {
     let trial = trial("door-lock", &run().models[0], 11, Outcome::Success, 50);
     folder.write_trial(&Trial { format: FORMAT + 1, ..trial }).unwrap();
     let error = evaluator::report(root.path()).unwrap_err().to_string();
-    assert!(error.ends_with("door-lock/cpn/11.json: expected format 1, got 2"), "{error}");
+    assert!(error.ends_with("door-lock/cpn/11.json: expected format 2, got 3"), "{error}");
 }

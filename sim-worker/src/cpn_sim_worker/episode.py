@@ -45,18 +45,21 @@ class EpisodeRunner:
             check_task(task)
         except UnknownTaskError as error:
             raise invalid("variation.task", error.expected, repr(task)) from None
+        field, goal_seed = (
+            ("goal_seed", request.goal_seed) if request.HasField("goal_seed") else ("variation.seed", seed)
+        )
         self.abandon()
         try:
-            for _ in solve(self._simulator, task, seed):
+            for _ in solve(self._simulator, task, goal_seed):
                 pass
         except ExpertFailedError as error:
             raise RequestError(
                 types_pb2.ERROR_CODE_FAILED_PRECONDITION,
-                "variation.seed",
+                field,
                 "a seed whose variation the scripted expert solves, for the goal image",
                 error.seed,
             ) from None
-        goal = self._frame()
+        goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
         self._simulator.reset(task, seed)
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
         return sim_pb2.ResetResponse(
@@ -64,7 +67,7 @@ class EpisodeRunner:
             goal=goal,
             observation=self._frame(),
             max_steps=self._max_steps,
-            goal_position=self._simulator.scene.goal_position.tolist(),
+            goal_position=goal_position,
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
