@@ -4,13 +4,14 @@ use crate::agent::Agent;
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use tch::Kind;
 
 /// Largest checkpoint that is read, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
 /// Version of the metadata; another one is refused.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// Where a model comes from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,6 +21,8 @@ pub struct Provenance {
     pub training_tasks: Vec<String>,
     /// SHA-256 over the digests of the training episodes, in hex.
     pub data_digest: String,
+    /// How the training frames were rendered, as the simulator's JSON; empty if their origin is unknown.
+    pub render_spec: String,
     /// Seed of initialisation and sampling.
     pub seed: u64,
     /// Passes over every frame.
@@ -63,10 +66,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     if bytes.len() > MAX_BYTES {
         return Err(CheckpointError::TooLarge { got: bytes.len() });
     }
-    let (tensors, metadata): (_, Metadata) = archive::from_bytes(bytes)?;
-    if metadata.format != FORMAT {
-        return Err(CheckpointError::Format { got: metadata.format });
+    // The version first: another one's metadata has other fields.
+    let (tensors, document): (_, Value) = archive::from_bytes(bytes)?;
+    if document["format"] != FORMAT {
+        return Err(CheckpointError::Format { got: document["format"].to_string() });
     }
+    let metadata: Metadata = serde_json::from_value(document).map_err(CheckpointError::Metadata)?;
     metadata.model.validate()?;
     let mut agent = Agent::new(metadata.model, 0);
     copy_weights(&tensors, &agent)?;
@@ -121,8 +126,11 @@ pub enum CheckpointError {
     #[error("checkpoint format: expected {FORMAT}, got {got}")]
     Format {
         /// Format that came.
-        got: u32,
+        got: String,
     },
+    /// Metadata that lack a field or have an unknown one.
+    #[error("checkpoint metadata: {0}")]
+    Metadata(serde_json::Error),
     /// A configuration out of range.
     #[error("checkpoint model: {0}")]
     Config(#[from] ConfigError),

@@ -11,7 +11,13 @@ use cpn::{Agent, Method, MethodKind};
 use serde_json::{Value, json};
 
 fn provenance() -> Provenance {
-    Provenance { training_tasks: vec!["door-lock".into()], data_digest: "d".into(), seed: 5, epochs: 2 }
+    Provenance {
+        training_tasks: vec!["door-lock".into()],
+        data_digest: "d".into(),
+        render_spec: r#"{"camera":"corner"}"#.into(),
+        seed: 5,
+        epochs: 2,
+    }
 }
 
 fn saved() -> Vec<u8> {
@@ -62,7 +68,10 @@ fn an_oversized_file_is_refused() {
 
 #[test]
 fn another_format_is_refused() {
-    assert_eq!(refusal(|_, m| m["format"] = json!(2)), "checkpoint format: expected 1, got 2");
+    assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 2, got 1");
+    // An older one lacks fields: that it is older is what counts.
+    assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 2, got 1");
+    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 2, got null");
 }
 
 #[test]

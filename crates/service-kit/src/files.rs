@@ -1,12 +1,16 @@
 //! Files that are there whole or not at all.
 
 use anyhow::Context;
-use std::fs::Permissions;
+use std::fs::{File, Permissions};
 use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-/// Writes a file by way of a temporary one beside it, so that no reader ever sees a part.
+/// How the names of temporary files begin.
+const UNFINISHED: &str = ".unfinished-";
+
+/// Writes a file by way of a temporary one beside it, so that no reader ever sees a part. When this returns, the file
+/// outlasts a crash.
 ///
 /// # Errors
 /// If the folder cannot be made or written.
@@ -16,11 +20,30 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
         std::fs::create_dir_all(folder)?;
         // Temporary files are private by default; this one becomes an ordinary file, as the umask would have it.
         let ordinary = Permissions::from_mode(0o666);
-        let mut file = tempfile::Builder::new().permissions(ordinary).tempfile_in(folder)?;
+        let mut file = tempfile::Builder::new().prefix(UNFINISHED).permissions(ordinary).tempfile_in(folder)?;
         file.write_all(bytes)?;
         file.as_file().sync_all()?;
         file.persist(path)?;
+        // The name is the folder's, and lasts when that does; `.` stands for an empty path.
+        File::open(Path::new(".").join(folder))?.sync_all()?;
         anyhow::Ok(())
     };
     write().with_context(|| format!("writing {}", path.display()))
+}
+
+/// Removes what killed processes left in a folder, which nobody else may be writing to.
+///
+/// # Errors
+/// If the folder cannot be read or written.
+pub fn remove_unfinished(folder: &Path) -> anyhow::Result<()> {
+    let remove = || {
+        for entry in std::fs::read_dir(folder)? {
+            let entry = entry?;
+            if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+                std::fs::remove_file(entry.path())?;
+            }
+        }
+        anyhow::Ok(())
+    };
+    remove().with_context(|| folder.display().to_string())
 }

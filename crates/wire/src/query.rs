@@ -99,10 +99,16 @@ pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
 pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Result<()> {
     match result {
         Ok(response) => reply_at(query, query.key_expr(), response),
-        Err(error) => {
-            query.reply_err(proto::Error::from(error).encode_to_vec()).encoding(encoding::<proto::Error>()).wait()
-        }
+        Err(error) => refuse(query, error),
     }
+}
+
+/// Answers a query with an error.
+///
+/// # Errors
+/// If zenoh cannot send it.
+pub fn refuse(query: &Query, error: Error) -> zenoh::Result<()> {
+    query.reply_err(proto::Error::from(error).encode_to_vec()).encoding(encoding::<proto::Error>()).wait()
 }
 
 /// Adds one of several answers to a query: the value that is at `key`, which the query's key must match.

@@ -34,8 +34,13 @@ impl Lab {
         static LABS: AtomicUsize = AtomicUsize::new(0);
         let namespace = format!("test-{}-{}", std::process::id(), LABS.fetch_add(1, Ordering::SeqCst));
         let folder = tempfile::tempdir().unwrap();
-        let provenance =
-            Provenance { training_tasks: vec!["door-open".into()], data_digest: "0".repeat(64), seed: 0, epochs: 0 };
+        let provenance = Provenance {
+            training_tasks: vec!["door-open".into()],
+            data_digest: "0".repeat(64),
+            render_spec: String::new(),
+            seed: 0,
+            epochs: 0,
+        };
         let agent = Agent::new(ModelConfig::paper(MethodKind::Cpn), 0);
         let models_dir = folder.path().join("models");
         std::fs::create_dir(&models_dir).unwrap();

@@ -52,6 +52,7 @@ impl PlannerCore {
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for an image that is not 84 x 84; `NOT_FOUND` for an unknown model or goal id;
+    /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently;
     /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
@@ -60,17 +61,17 @@ impl PlannerCore {
         if !self.thread.models().contains_key(&model) {
             return Err(unknown_model(&model, self.thread.models().keys()));
         }
-        let (goal_id, goal) = match goal {
+        let (goal_field, (goal_id, goal)) = match goal {
             Goal::Id(id) => {
                 let image = self.goals.get(&id)?;
-                (id, image)
+                ("goal_id", (id, image))
             }
             Goal::Image(image) => {
                 check_size("goal_image", &image)?;
-                self.goals.register(image)
+                ("goal_image.render_spec", self.goals.register(image))
             }
         };
-        self.thread.plan(PlanTask { model, goal_id, goal, observation, seed, deadline }).await
+        self.thread.plan(PlanTask { model, goal_id, goal, goal_field, observation, seed, deadline }).await
     }
 
     /// Keeps a goal image; the same image gets the same id.

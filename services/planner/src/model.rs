@@ -1,6 +1,7 @@
 //! A model as it is served, and what is checked before it is.
 
-use cpn::{Method, Random, checkpoint};
+use cpn::checkpoint::{self, Provenance};
+use cpn::{Method, Random};
 use std::fmt;
 use std::fs::File;
 use std::io::{self, Read};
@@ -18,6 +19,8 @@ const RANDOM_ACTIONS: i64 = 4;
 pub struct Model {
     /// What clients are told of it.
     pub info: ModelInfo,
+    /// How the pictures were rendered that it was trained on; empty if their origin is unknown.
+    pub render_spec: String,
     /// What plans.
     pub method: Box<dyn Method>,
 }
@@ -38,7 +41,11 @@ impl Model {
     pub(crate) fn random() -> Self {
         let method = Random { actions: RANDOM_ACTIONS };
         let digest = checkpoint::digest(RANDOM.as_bytes());
-        Self { info: info(RANDOM.to_owned(), &method, digest, Vec::new()), method: Box::new(method) }
+        Self {
+            info: info(RANDOM.to_owned(), &method, digest, Vec::new()),
+            render_spec: String::new(),
+            method: Box::new(method),
+        }
     }
 
     /// Reads a checkpoint, from the bytes or from a file in `folder`, and tries it once. Blocks.
@@ -55,8 +62,9 @@ impl Model {
         };
         let loaded =
             checkpoint::from_bytes(&bytes).map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
-        let info = info(request.model, &loaded.agent, loaded.digest, loaded.provenance.training_tasks);
-        let model = Self { info, method: Box::new(loaded.agent) };
+        let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
+        let info = info(request.model, &loaded.agent, loaded.digest, training_tasks);
+        let model = Self { info, render_spec, method: Box::new(loaded.agent) };
         model.warm_up()?;
         Ok(model)
     }

@@ -21,6 +21,8 @@ pub(crate) struct PlanTask {
     pub(crate) model: String,
     pub(crate) goal_id: String,
     pub(crate) goal: Arc<Image>,
+    /// The request's field that the goal's render spec came from.
+    pub(crate) goal_field: &'static str,
     pub(crate) observation: Image,
     pub(crate) seed: u64,
     pub(crate) deadline: Option<Duration>,
@@ -180,6 +182,7 @@ impl Owner {
 
     fn plan(&mut self, task: &PlanTask) -> Result<PlanResponse, Error> {
         let model = self.models.get(&task.model).ok_or_else(|| unknown_model(&task.model, self.models.keys()))?;
+        check_render_specs(task, &model.render_spec)?;
         let started = Instant::now();
         // One by one: in a batch an embedding could differ, in its last bits, with what else is in the batch.
         let x = model.encode(&task.observation);
@@ -202,6 +205,19 @@ impl Owner {
             goal_id: task.goal_id.clone(),
         })
     }
+}
+
+/// A plan is only worth something between pictures of one look, and by a model that learnt from that look. What does not
+/// say how it was rendered goes with everything.
+fn check_render_specs(task: &PlanTask, model: &str) -> Result<(), Error> {
+    let (observation, goal) = (task.observation.render_spec(), task.goal.render_spec());
+    let expected = [model, goal].into_iter().find(|spec| !spec.is_empty()).unwrap_or(observation);
+    for (field, got) in [(task.goal_field, goal), ("observation.render_spec", observation)] {
+        if !got.is_empty() && got != expected {
+            return Err(Error::new(Code::FailedPrecondition, field, expected, got));
+        }
+    }
+    Ok(())
 }
 
 /// The named model is not among those served.

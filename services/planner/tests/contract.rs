@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Client, Fixture, checkpoint, from_bytes, from_file, image, plan_request, timeless};
+use common::{Client, Fixture, checkpoint, checkpoint_for, from_bytes, from_file, image, plan_request, timeless};
 use cpn::MethodKind;
 use planner::model::RANDOM;
 use wire::planner::{ModelInfo, PlanResponse};
@@ -129,6 +129,47 @@ async fn every_transport_refuses_alike() {
             assert_eq!((error.code, error.field.as_str()), (code, field), "{transport}: {error}");
         }
         client.plan(plan_request("cpn", 3)).await.unwrap();
+    }
+}
+
+/// Pictures of different looks never meet: not with each other, not with a model that learnt from another look.
+#[tokio::test(flavor = "multi_thread")]
+async fn every_transport_keeps_looks_apart() {
+    // As long as real ones: an error has to carry two of them whole.
+    let [soft, hard] =
+        ["soft", "hard"].map(|shadows| format!("{{\"shadows\":\"{shadows}\",\"x\":\"{}\"}}", "x".repeat(300)));
+    let checkpoints = [("cpn", checkpoint(MethodKind::Cpn, 1)), ("soft", checkpoint_for(MethodKind::Cpn, 1, &soft))];
+    let fixture = Fixture::start(&checkpoints, |_| ()).await;
+    let look = |spec: &str, seed| proto::Image { render_spec: spec.into(), ..image(seed) };
+    let request = |model: &str, goal: &str, observation: &str| proto::PlanRequest {
+        goal: Some(Goal::GoalImage(look(goal, 0))),
+        observation: Some(look(observation, 3)),
+        ..plan_request(model, 3)
+    };
+    let (observation, goal_image) = ("observation.render_spec", "goal_image.render_spec");
+    let refused = |field: &str| Error::new(Code::FailedPrecondition, field, &soft, &hard);
+    for client in fixture.clients() {
+        let transport = client.transport();
+        for (model, goal, shown, field) in [
+            ("soft", &*soft, &*hard, observation),
+            ("soft", "", &hard, observation),
+            ("soft", &hard, &soft, goal_image),
+            ("soft", &hard, &hard, goal_image),
+            ("cpn", &soft, &hard, observation),
+            (RANDOM, &soft, &hard, observation),
+        ] {
+            let error = client.plan(request(model, goal, shown)).await.unwrap_err();
+            assert_eq!(error, refused(field), "{transport}, {model}");
+        }
+        let register = proto::RegisterGoalRequest { image: Some(look(&hard, 0)) };
+        let goal_id = client.register_goal(register).await.unwrap().goal_id;
+        let by_id = proto::PlanRequest { goal: Some(Goal::GoalId(goal_id)), ..request("soft", "", &soft) };
+        assert_eq!(client.plan(by_id).await.unwrap_err(), refused("goal_id"), "{transport}");
+        for (model, goal, shown) in
+            [("soft", &*soft, &*soft), ("soft", "", ""), ("soft", "", &soft), ("cpn", &hard, &hard), ("cpn", "", &soft)]
+        {
+            client.plan(request(model, goal, shown)).await.unwrap();
+        }
     }
 }
 

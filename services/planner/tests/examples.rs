@@ -2,6 +2,8 @@
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
+mod common;
+
 use std::path::Path;
 use std::process::Command;
 
@@ -16,7 +18,7 @@ fn the_readme_shows_the_examples_as_they_are() {
     }
 }
 
-/// Runs an example of the sim-worker's environment against a planner with the shipped checkpoints.
+/// Runs an example in the sim-worker's environment against a planner.
 async fn run(example: &str, endpoint: String) {
     let python = Path::new(ROOT).join("sim-worker/.venv/bin/python");
     let mut command = Command::new(python);
@@ -29,8 +31,11 @@ async fn run(example: &str, endpoint: String) {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_python_examples_get_plans() {
     let endpoint = "tcp/127.0.0.1:17481";
+    let models_dir = tempfile::tempdir().unwrap();
+    let checkpoint = common::checkpoint(cpn::MethodKind::Cpn, 1);
+    std::fs::write(models_dir.path().join("cpn.safetensors"), checkpoint).unwrap();
     let config = planner::Config {
-        models_dir: Path::new(ROOT).join("models"),
+        models_dir: models_dir.path().into(),
         grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: service_kit::SessionConfig { listen: vec![endpoint.into()], ..Default::default() },
         ..planner::Config::default()

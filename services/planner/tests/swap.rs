@@ -159,8 +159,13 @@ async fn an_announced_checkpoint_is_fetched() {
     let [client, ..] = fixture.clients();
     // Larger than one piece.
     let large = cpn::Agent::new(cpn::ModelConfig::paper(MethodKind::TeBc), 4);
-    let provenance =
-        cpn::checkpoint::Provenance { training_tasks: vec![], data_digest: "d".into(), seed: 4, epochs: 0 };
+    let provenance = cpn::checkpoint::Provenance {
+        training_tasks: vec![],
+        data_digest: "d".into(),
+        render_spec: String::new(),
+        seed: 4,
+        epochs: 0,
+    };
     let bytes = cpn::checkpoint::to_bytes(&large, &provenance).unwrap();
     assert!(bytes.len() > 2 * wire::checkpoint::MAX_CHUNK_BYTES as usize);
     let digest = cpn::checkpoint::digest(&bytes);

@@ -1,21 +1,23 @@
 //! The demonstrations of a training run, in memory.
 
 use crate::episode::Episode;
+use crate::recordings::{self, dataset_digest};
 use anyhow::{Context, ensure};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use tch::{Device, Kind, Tensor};
+use wire::demonstration::RecordedEpisode;
 
 /// Every frame with an action, of every episode that is not held out.
 #[derive(Debug)]
 pub struct Dataset {
     episodes: Vec<Episode>,
-    tasks: BTreeSet<String>,
     samples: Vec<Sample>,
+    infos: Vec<RecordedEpisode>,
+    render_spec: String,
     digest: String,
 }
 
@@ -43,45 +45,56 @@ impl Dataset {
     /// Reads every episode of `folder` but those of the `held_out` tasks.
     ///
     /// # Errors
-    /// If an episode is damaged, the episodes differ in the size of their actions, none is left, or a held-out task has
-    /// none, which is more likely a slip of the pen than meant.
+    /// If a recording is damaged, the episodes differ in the size of their actions or in how they were rendered, none is
+    /// left, or a held-out task has none, which is more likely a slip of the pen than meant.
     pub fn load(folder: &Path, held_out: &[String]) -> anyhow::Result<Self> {
-        let all_tasks = names(folder)?;
+        let all_tasks = recordings::tasks(folder)?;
         for task in held_out {
             ensure!(all_tasks.contains(task), "hold_out: expected some of {all_tasks:?}, got {task:?}");
         }
-        let mut dataset =
-            Self { episodes: Vec::new(), tasks: BTreeSet::new(), samples: Vec::new(), digest: String::new() };
-        let mut hasher = Sha256::new();
-        for task in all_tasks.into_iter().filter(|task| !held_out.contains(task)) {
-            let folder = folder.join(&task);
-            for name in names(&folder)?.into_iter().filter(|name| name.ends_with(".safetensors")) {
-                let path: PathBuf = folder.join(name);
-                let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-                hasher.update(Sha256::digest(&bytes));
-                dataset.push(Episode::from_bytes(&bytes).with_context(|| path.display().to_string())?)?;
+        let mut dataset = Self {
+            episodes: Vec::new(),
+            samples: Vec::new(),
+            infos: Vec::new(),
+            render_spec: String::new(),
+            digest: String::new(),
+        };
+        let held_out: Vec<_> = held_out.iter().map(|task| folder.join(task)).collect();
+        for path in recordings::paths(folder)? {
+            if !held_out.iter().any(|task| path.starts_with(task)) {
+                let mut add = || dataset.push(&recording::read(&path)?);
+                add().with_context(|| path.display().to_string())?;
             }
-            dataset.tasks.insert(task);
         }
         ensure!(!dataset.episodes.is_empty(), "{}: expected demonstrations, got none", folder.display());
-        dataset.digest = hex::encode(hasher.finalize());
+        dataset.digest = dataset_digest(&dataset.infos);
         Ok(dataset)
     }
 
-    fn push(&mut self, episode: Episode) -> anyhow::Result<()> {
+    fn push(&mut self, recording: &recording::Episode) -> anyhow::Result<()> {
+        let episode = Episode::from_recording(recording)?;
         if let Some(first) = self.episodes.first() {
             let (expected, got) = (first.actions.size()[1], episode.actions.size()[1]);
-            ensure!(expected == got, "{}: expected {expected} action values, got {got}", episode.info.episode_id);
+            ensure!(expected == got, "actions: expected {expected} values like the episodes before, got {got}");
+            let (expected, got) = (&self.render_spec, recording.render_spec());
+            ensure!(expected == got, "render_spec: expected {expected:?} like the episodes before, got {got:?}");
         }
+        self.render_spec = recording.render_spec().to_owned();
         let index = self.episodes.len();
         self.samples.extend((0..episode.action_count()).map(|step| Sample { episode: index, step }));
         self.episodes.push(episode);
+        self.infos.push(recording.info().clone());
         Ok(())
     }
 
     /// Names of the tasks, in order.
-    pub fn tasks(&self) -> impl Iterator<Item = &str> {
-        self.tasks.iter().map(String::as_str)
+    pub fn tasks(&self) -> BTreeSet<&str> {
+        self.infos.iter().map(|info| info.variation.task.as_str()).collect()
+    }
+
+    /// How every frame was rendered; empty for those of a real camera.
+    pub fn render_spec(&self) -> &str {
+        &self.render_spec
     }
 
     /// Number of episodes.
@@ -99,7 +112,7 @@ impl Dataset {
         self.episodes[0].actions.size()[1]
     }
 
-    /// SHA-256 over the digests of the episodes, in hex.
+    /// What [`dataset_digest`] gives for the episodes.
     pub fn digest(&self) -> &str {
         &self.digest
     }
@@ -131,14 +144,4 @@ impl Dataset {
         }
         Batch { observations: Tensor::stack(&observations, 0), goals: Tensor::stack(&goals, 0), actions, mask }
     }
-}
-
-/// Names in a folder, in order.
-fn names(folder: &Path) -> anyhow::Result<Vec<String>> {
-    let entries = std::fs::read_dir(folder).with_context(|| folder.display().to_string())?;
-    let mut names = entries
-        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
-        .collect::<anyhow::Result<Vec<_>>>()?;
-    names.sort();
-    Ok(names)
 }

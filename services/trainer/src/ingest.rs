@@ -1,51 +1,78 @@
-//! Keeps the episodes of demonstration streams.
+//! Takes in demonstration streams.
 //!
 //! Steps are numbered and never acknowledged one by one: the sender commits an episode, and the answer tells which
 //! steps are still missing. An episode that is kept already answers that nothing is, so that a sender can always begin
-//! by committing, and a stream can be sent again without harm.
+//! by committing, and a stream can be sent again without harm. What is lost on the way, or dropped because too many
+//! episodes are under way, is missing at the next commit, and so is never lost for good.
 
-use crate::episode::{self, Episode};
-use lru::LruCache;
-use service_kit::files;
-use std::collections::BTreeMap;
-use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
+use crate::episode::check_frame;
+use crate::recordings::Recordings;
+use recording::Episode;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use tracing::{info, warn};
-use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse, DemonstrationStep};
-use wire::{Code, Error, key, query};
-use zenoh::Session;
+use std::time::{Duration, Instant};
+use tracing::info;
+use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpisode};
+use wire::{Code, Error};
 
-/// Episodes that may be under way at once; past that, the one that was silent longest is given up.
-const MAX_OPEN_EPISODES: NonZeroUsize = NonZeroUsize::new(64).expect("not zero");
+/// How much may be under way.
+#[derive(Debug, Clone)]
+pub struct Limits {
+    /// Episodes at once; each may take as much memory as 1000 frames. A new one waits until another is kept.
+    pub episodes: usize,
+    /// An episode that nobody has sent a step of for so long is given up.
+    pub silence: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { episodes: 16, silence: Duration::from_secs(30) }
+    }
+}
+
+/// What a commit led to.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Commit {
+    /// These steps are to be sent again.
+    Missing(Vec<u32>),
+    /// The episode is on disk since now.
+    Kept,
+    /// The episode was on disk before.
+    KeptBefore,
+}
+
+/// Episodes under way, and those that are kept.
+#[derive(Debug)]
+pub struct Ingest {
+    recordings: Arc<Recordings>,
+    limits: Limits,
+    open: Mutex<HashMap<String, Open>>,
+}
 
 /// An episode under way.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Open {
     steps: BTreeMap<u32, DemonstrationStep>,
     /// Why it can no longer be kept; the next commit is told.
     fault: Option<Error>,
-}
-
-/// Episodes under way, and the folder of those that are kept.
-#[derive(Debug)]
-pub struct Ingest {
-    folder: PathBuf,
-    open: Mutex<LruCache<String, Open>>,
+    heard: Instant,
 }
 
 impl Ingest {
-    /// Keeps episodes as `folder/<task>/<episode id>.safetensors`.
-    pub fn new(folder: PathBuf) -> Self {
-        Self { folder, open: Mutex::new(LruCache::new(MAX_OPEN_EPISODES)) }
+    /// Keeps episodes among `recordings`.
+    pub fn new(recordings: Arc<Recordings>, limits: Limits) -> Self {
+        Self { recordings, limits, open: Mutex::default() }
     }
 
     /// Takes in one step; a step that is there already is replaced. A frame of another size is not held, which bounds
     /// what a stranger's stream can take.
     pub fn step(&self, step: DemonstrationStep) {
+        if self.recordings.contains(&step.episode_id) {
+            return;
+        }
         let mut open = self.open();
-        let episode = open.get_or_insert_mut(step.episode_id.clone(), Open::default);
-        match episode::check_frame(&step) {
+        let Some(episode) = self.place(&mut open, &step.episode_id) else { return };
+        match check_frame(&step) {
             Ok(()) => drop(episode.steps.insert(step.step, step)),
             Err(fault) => episode.fault = Some(fault),
         }
@@ -54,71 +81,72 @@ impl Ingest {
     /// Keeps an episode if every step is there, else answers which are missing.
     ///
     /// # Errors
-    /// If the steps do not make an episode, which is then forgotten, or the file cannot be written.
-    pub fn commit(&self, request: &CommitEpisodeRequest) -> Result<CommitEpisodeResponse, Error> {
-        let path = episode_path(&self.folder, &request.variation.task, &request.episode_id);
-        if path.exists() {
-            self.open().pop(&request.episode_id);
-            return Ok(CommitEpisodeResponse { missing_steps: Vec::new() });
+    /// `INVALID_ARGUMENT` if the steps do not make the episode, which is then forgotten; `FAILED_PRECONDITION` if another
+    /// one is kept under its id, or it was rendered otherwise than those that are kept; `RESOURCE_EXHAUSTED` if too many
+    /// are under way; `INTERNAL` if the file cannot be written.
+    pub fn commit(&self, request: &CommitEpisodeRequest) -> Result<Commit, Error> {
+        let RecordedEpisode { episode_id, steps: count, .. } = &request.episode;
+        if let Some(kept) = self.recordings.get(episode_id) {
+            self.open().remove(episode_id);
+            return check_same(&kept, &request.episode).map(|()| Commit::KeptBefore);
         }
         let steps = {
             let mut open = self.open();
-            let mut episode = open.pop(&request.episode_id).unwrap_or_default();
+            let episode = self.place(&mut open, episode_id).ok_or_else(|| self.full())?;
             if let Some(fault) = episode.fault.take() {
+                open.remove(episode_id);
                 return Err(fault);
             }
-            let missing_steps: Vec<u32> = (0..request.steps).filter(|step| !episode.steps.contains_key(step)).collect();
-            if !missing_steps.is_empty() {
-                open.put(request.episode_id.clone(), episode);
-                return Ok(CommitEpisodeResponse { missing_steps });
+            let missing: Vec<u32> = (0..*count).filter(|step| !episode.steps.contains_key(step)).collect();
+            if !missing.is_empty() {
+                return Ok(Commit::Missing(missing));
             }
-            episode.steps
+            let steps = std::mem::take(&mut episode.steps);
+            open.remove(episode_id);
+            steps
         };
-        if let Some((&extra, _)) = steps.range(request.steps..).next() {
-            return Err(Error::invalid("steps", format!("all steps below {}", request.steps), extra));
+        if let Some((&extra, _)) = steps.range(count..).next() {
+            return Err(Error::invalid("steps", format!("all steps below {count}"), extra));
         }
-        let episode = Episode::from_steps(request, &steps.into_values().collect::<Vec<_>>())?;
-        let written = episode.to_bytes().and_then(|bytes| files::write_atomically(&path, &bytes));
-        written.map_err(|e| Error::new(Code::Internal, "episode_id", "a kept episode", format!("{e:#}")))?;
-        info!(episode = request.episode_id, steps = request.steps, "kept");
-        Ok(CommitEpisodeResponse { missing_steps: Vec::new() })
+        self.recordings.keep(&Episode::new(request.episode.clone(), steps.into_values().collect())?)?;
+        info!(episode = episode_id, steps = count, "kept");
+        Ok(Commit::Kept)
     }
 
-    fn open(&self) -> MutexGuard<'_, LruCache<String, Open>> {
+    /// The place of an episode under way, which is heard of now; none if all places are taken.
+    fn place<'a>(&self, open: &'a mut HashMap<String, Open>, episode_id: &str) -> Option<&'a mut Open> {
+        let now = Instant::now();
+        if !open.contains_key(episode_id) && open.len() >= self.limits.episodes {
+            open.retain(|_, episode| now - episode.heard < self.limits.silence);
+            if open.len() >= self.limits.episodes {
+                return None;
+            }
+        }
+        let new = || Open { steps: BTreeMap::new(), fault: None, heard: now };
+        let episode = open.entry(episode_id.to_owned()).or_insert_with(new);
+        episode.heard = now;
+        Some(episode)
+    }
+
+    fn full(&self) -> Error {
+        Error::new(Code::ResourceExhausted, "episode_id", "a free place", format!("{} under way", self.limits.episodes))
+    }
+
+    fn open(&self) -> MutexGuard<'_, HashMap<String, Open>> {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Where an episode is kept.
-fn episode_path(folder: &Path, task: &str, episode_id: &str) -> PathBuf {
-    folder.join(task).join(format!("{episode_id}.safetensors"))
-}
-
-/// Serves demonstration streams until the session closes.
-///
-/// # Errors
-/// If zenoh refuses a declaration.
-pub async fn serve(session: &Session, ingest: Arc<Ingest>) -> zenoh::Result<()> {
-    let receiver = Arc::clone(&ingest);
-    // The callback only copies a frame. It must be done before the next message is read: a commit follows its steps.
-    let _steps = session
-        .declare_subscriber(key::demonstration_step("*", "*")?)
-        .callback(move |sample| match wire::decode(&sample.payload().to_bytes()) {
-            Ok(step) => receiver.step(step),
-            Err(error) => warn!(key = %sample.key_expr(), %error, "step refused"),
-        })
-        .await?;
-    let commits = session.declare_queryable(key::demonstration_commit("*")?).complete(true).await?;
-    while let Ok(query) = commits.recv_async().await {
-        let ingest = Arc::clone(&ingest);
-        let answered = tokio::task::spawn_blocking(move || {
-            let answer = query::request(&query).and_then(|request| ingest.commit(&request));
-            if let Err(error) = &answer {
-                warn!(key = %query.key_expr(), %error, "commit refused");
-            }
-            query::reply(&query, answer)
-        });
-        answered.await??;
+/// Checks that what is kept under an id is what is offered under it.
+pub(crate) fn check_same(kept: &RecordedEpisode, offered: &RecordedEpisode) -> Result<(), Error> {
+    let refused = |field, expected: &dyn ToString, got: &dyn ToString| {
+        Err(Error::new(Code::FailedPrecondition, field, expected.to_string(), got.to_string()))
+    };
+    if kept.digest != offered.digest {
+        return refused("digest", &kept.digest, &offered.digest);
+    }
+    if kept.variation != offered.variation {
+        return refused("variation", &format!("{:?}", kept.variation), &format!("{:?}", offered.variation));
     }
     Ok(())
 }

@@ -1,88 +1,17 @@
-//! `cpn-trainer`: the service that takes in demonstrations and publishes checkpoints, and the training run.
+//! `cpn-trainer`: the service that takes in demonstrations and publishes checkpoints, the training run, and what else is
+//! done with recordings.
 
-use clap::{Args, Parser, Subcommand};
-use serde::Serialize;
-use service_kit::{SessionConfig, config, shutdown, telemetry};
-use std::path::PathBuf;
+mod cli;
+
+use anyhow::{anyhow, ensure};
+use clap::Parser;
+use cli::{Cli, Command, MirrorArgs, ReplayArgs, VerifyArgs};
+use service_kit::{config, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use trainer::service;
+use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
-
-/// Take in demonstrations, train the learned methods, publish checkpoints.
-#[derive(Debug, Parser)]
-#[command(version)]
-struct Cli {
-    /// TOML file with the settings of the command.
-    #[arg(long, global = true)]
-    config: Option<PathBuf>,
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Debug, Subcommand)]
-enum Command {
-    /// Keep the episodes of demonstration streams and publish the checkpoints of a folder.
-    Serve(ServeArgs),
-    /// Train a method; the same command goes on where an interrupted one stopped.
-    Train(TrainArgs),
-}
-
-/// What was typed; what was not is left to the environment, the file and the defaults.
-#[derive(Debug, Args, Serialize)]
-struct ServeArgs {
-    /// Where episodes are kept.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    dataset: Option<PathBuf>,
-    /// Whose checkpoints are published.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    checkpoints: Option<PathBuf>,
-    #[command(flatten)]
-    session: SessionConfig,
-}
-
-/// What was typed; what was not is left to the environment, the file and the defaults.
-#[derive(Debug, Args, Serialize)]
-struct TrainArgs {
-    /// Folder of the demonstrations.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    dataset: Option<PathBuf>,
-    /// Where the checkpoint goes.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    out: Option<PathBuf>,
-    /// Method to train: bc, te-bc, upn or cpn.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    method: Option<String>,
-    /// Encoder to train it with: paper or upn.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    encoder: Option<String>,
-    /// Tasks that the model must not see.
-    #[arg(long, value_delimiter = ',')]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    hold_out: Option<Vec<String>>,
-    /// Passes over every frame.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    epochs: Option<u32>,
-    /// Samples of a step.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    batch_size: Option<usize>,
-    /// Seed of initialisation and sampling.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    seed: Option<u64>,
-    /// Threads of libtorch.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    threads: Option<i32>,
-}
+use trainer::{mirror, replay, service, verify};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
@@ -91,6 +20,9 @@ async fn main() -> anyhow::Result<()> {
     match cli.command {
         Command::Serve(arguments) => serve(config::load("CPN_TRAINER_", cli.config.as_deref(), &arguments)?).await,
         Command::Train(arguments) => train(config::load("CPN_TRAIN_", cli.config.as_deref(), &arguments)?).await,
+        Command::Replay(arguments) => replay(arguments).await,
+        Command::Mirror(arguments) => mirror(arguments).await,
+        Command::Verify(arguments) => verify(&arguments),
     }
 }
 
@@ -119,5 +51,35 @@ async fn train(config: train::Config) -> anyhow::Result<()> {
         Outcome::Finished { digest } => tracing::info!(digest, "checkpoint written"),
         Outcome::Interrupted { step } => tracing::info!(step, "interrupted; the same command goes on from here"),
     }
+    Ok(())
+}
+
+async fn replay(ReplayArgs { dataset, tasks, session }: ReplayArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    replay::run(&session, &dataset, &tasks).await?;
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Result<()> {
+    let recordings = Arc::new(Recordings::open(dataset)?);
+    let session = session::open(&session).await?;
+    let work = async {
+        if once { Ok(mirror::once(&session, &recordings).await?) } else { mirror::follow(&session, &recordings).await }
+    };
+    tokio::select! {
+        done = work => done.map_err(|e| anyhow!(e))?,
+        signal = shutdown::requested() => signal?,
+    }
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+fn verify(VerifyArgs { dataset, episodes, json }: &VerifyArgs) -> anyhow::Result<()> {
+    let report = verify::run(dataset, *episodes)?;
+    if *json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        print!("{report}");
+    }
+    ensure!(report.faults.is_empty(), "{}: {} faults", dataset.display(), report.faults.len());
     Ok(())
 }

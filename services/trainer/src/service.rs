@@ -1,7 +1,9 @@
 //! The trainer's network face: demonstrations in, checkpoints out.
 
-use crate::ingest::{self, Ingest};
+use crate::ingest::{Ingest, Limits};
 use crate::publish;
+use crate::recorder::{self, Recorder};
+use crate::recordings::Recordings;
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
 use service_kit::SessionConfig;
@@ -35,21 +37,24 @@ impl Default for Config {
 #[derive(Debug)]
 pub struct Service {
     session: zenoh::Session,
+    recorder: Recorder,
     tasks: JoinSet<anyhow::Result<()>>,
 }
 
-/// Starts the service.
+/// Starts the service; when this returns, it answers.
 ///
 /// # Errors
-/// If the session cannot be opened.
+/// If the dataset is mixed or cannot be read, or the session cannot be opened.
 pub async fn start(config: Config) -> anyhow::Result<Service> {
+    let folder = config.dataset.clone();
+    let recordings = Arc::new(tokio::task::spawn_blocking(move || Recordings::open(folder)).await??);
     let session = service_kit::session::open(&config.session).await?;
+    let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
+    let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
     let mut tasks = JoinSet::new();
-    let (receiver, publisher) = (session.clone(), session.clone());
-    let kept = Arc::new(Ingest::new(config.dataset));
-    tasks.spawn(async move { ingest::serve(&receiver, kept).await.map_err(|e| anyhow!(e)) });
+    let publisher = session.clone();
     tasks.spawn(async move { publish::serve(&publisher, config.checkpoints).await });
-    Ok(Service { session, tasks })
+    Ok(Service { session, recorder, tasks })
 }
 
 impl Service {
@@ -69,6 +74,7 @@ impl Service {
     /// # Errors
     /// If the session does not close.
     pub async fn shutdown(mut self) -> anyhow::Result<()> {
+        drop(self.recorder);
         self.tasks.shutdown().await;
         self.session.close().await.map_err(|e| anyhow!(e))
     }

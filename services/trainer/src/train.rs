@@ -99,7 +99,7 @@ pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcom
         tch::set_num_threads(config.threads);
     }
     let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
-    let tasks: Vec<String> = dataset.tasks().map(str::to_owned).collect();
+    let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
     info!(tasks = tasks.len(), episodes = dataset.episode_count(), samples = dataset.sample_count(), "demonstrations");
 
     let model = ModelConfig {
@@ -144,6 +144,7 @@ pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcom
     let provenance = Provenance {
         training_tasks: tasks,
         data_digest: dataset.digest().to_owned(),
+        render_spec: dataset.render_spec().to_owned(),
         seed: config.seed,
         epochs: config.epochs,
     };

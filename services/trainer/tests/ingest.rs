@@ -4,24 +4,16 @@
 
 mod common;
 
-use common::{commit, step};
-use service_kit::SessionConfig;
-use std::path::Path;
+use common::{commit, episode, files, info, record, sessions, steps};
+use recording::Episode;
 use std::time::Duration;
-use trainer::episode::Episode;
-use trainer::service;
-use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse, DemonstrationStep};
-use wire::{Code, Error, Image, encode, key, query};
+use tokio::task::JoinSet;
+use trainer::ingest::Limits;
+use trainer::recordings::Recordings;
+use trainer::replay;
+use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse, DemonstrationStep, RecordedEpisode};
+use wire::{Code, Error, Image, decode, encode, key, query};
 use zenoh::Session;
-
-/// A trainer that keeps episodes in `folder`, and a worker's session.
-async fn start(folder: &Path, endpoint: &str) -> (service::Service, Session) {
-    let session = SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() };
-    let (dataset, checkpoints) = (folder.join("data"), folder.join("checkpoints"));
-    let trainer = service::start(service::Config { dataset, checkpoints, session }).await.unwrap();
-    let session = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
-    (trainer, service_kit::session::open(&session).await.unwrap())
-}
 
 async fn send(session: &Session, step: DemonstrationStep) {
     let key = key::demonstration_step(&step.episode_id, &step.step.to_string()).unwrap();
@@ -30,7 +22,7 @@ async fn send(session: &Session, step: DemonstrationStep) {
 
 /// Commits as a worker does: again as long as nobody answers.
 async fn send_commit(session: &Session, request: &CommitEpisodeRequest) -> Result<Vec<u32>, Error> {
-    let key = key::demonstration_commit(&request.episode_id).unwrap();
+    let key = key::demonstration_commit(&request.episode.episode_id).unwrap();
     loop {
         let timeout = Duration::from_secs(10);
         match query::call::<_, CommitEpisodeResponse>(session, &key, request.clone(), timeout).await {
@@ -43,61 +35,157 @@ async fn send_commit(session: &Session, request: &CommitEpisodeRequest) -> Resul
 #[tokio::test(flavor = "multi_thread")]
 async fn a_stream_with_losses_is_kept_whole_in_the_end() {
     let folder = tempfile::tempdir().unwrap();
-    let (trainer, worker) = start(folder.path(), "tcp/127.0.0.1:17451").await;
-    let request = commit("door-lock", 3, 6);
+    let (trainer, worker) = sessions("tcp/127.0.0.1:17451").await;
+    let _recorder = record(&trainer, folder.path(), Limits::default()).await;
+    let episode = episode("door-lock", 3, 6);
+    let (request, steps) = (commit(&episode), episode.steps());
     assert_eq!(send_commit(&worker, &request).await.unwrap(), [0, 1, 2, 3, 4, 5], "nothing was sent yet");
     for number in [0, 1, 3, 5, 1] {
-        send(&worker, step(&request, number)).await;
+        send(&worker, steps[number].clone()).await;
     }
     assert_eq!(send_commit(&worker, &request).await.unwrap(), [2, 4]);
-    send(&worker, step(&request, 2)).await;
-    send(&worker, step(&request, 4)).await;
+    send(&worker, steps[2].clone()).await;
+    send(&worker, steps[4].clone()).await;
     assert!(send_commit(&worker, &request).await.unwrap().is_empty(), "complete");
     assert!(send_commit(&worker, &request).await.unwrap().is_empty(), "an episode is kept once");
+    assert_eq!(recording::read(&folder.path().join("door-lock/door-lock-3.mcap")).unwrap(), episode);
 
-    let episode = Episode::read(&folder.path().join("data/door-lock/door-lock-3.safetensors")).unwrap();
-    assert_eq!((episode.action_count(), episode.info.task.as_str(), episode.info.seed), (5, "door-lock", 3));
-    for number in 0..6u32 {
-        let sent = step(&request, number);
-        let frame = Vec::<u8>::try_from(episode.frames.get(number.into()).view(-1)).unwrap();
-        assert_eq!(frame, sent.frame.data(), "frame {number}");
-        if let Some(action) = sent.action {
-            assert_eq!(Vec::<f32>::try_from(episode.actions.get(number.into())).unwrap(), action);
-        }
-    }
-    trainer.shutdown().await.unwrap();
+    let mut other = request.clone();
+    other.episode.digest = "0".repeat(64);
+    let error = send_commit(&worker, &other).await.unwrap_err();
+    let expected = Error::new(Code::FailedPrecondition, "digest", &request.episode.digest, &other.episode.digest);
+    assert_eq!(error, expected, "another episode under the same id");
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
     let folder = tempfile::tempdir().unwrap();
-    let (trainer, worker) = start(folder.path(), "tcp/127.0.0.1:17452").await;
-    let request = commit("reach", 1, 3);
-    type Spoil<'a> = &'a dyn Fn(u32, &mut DemonstrationStep);
-    let cases: [(&str, Spoil<'_>); 4] = [
-        ("steps[1].frame", &|number, step| {
-            if number == 1 {
-                step.frame = Image::new(8, 8, vec![0; 192]).unwrap();
-            }
-        }),
-        ("steps[2].action", &|_, step| step.action = Some(vec![0.0; 4])),
-        ("steps[1].action", &|number, step| step.action = (number == 0).then(|| vec![0.0; 4])),
-        ("steps[0].action", &|_, step| step.action = step.action.take().map(|_| vec![1.5; 4])),
+    let (trainer, worker) = sessions("tcp/127.0.0.1:17452").await;
+    let _recorder = record(&trainer, folder.path(), Limits::default()).await;
+    let good = episode("reach", 1, 3);
+    type Spoil = fn(&mut Vec<DemonstrationStep>);
+    let cases: [(&str, Spoil); 6] = [
+        ("steps[1].frame", |s| s[1].frame = Image::new(8, 8, vec![0; 192]).unwrap()),
+        ("steps[2].action", |s| s[2].action = Some(vec![0.0; 4])),
+        ("steps[1].action", |s| s[1].action = None),
+        ("steps[0].action", |s| s[0].action = Some(vec![1.5; 4])),
+        ("steps[1].frame.render_spec", |s| s[1].frame = s[1].frame.clone().rendered_as("other").unwrap()),
+        ("digest", |s| s[1].reward = 9.0),
     ];
     for (field, spoil) in cases {
-        for number in 0..3 {
-            let mut step = step(&request, number);
-            spoil(number, &mut step);
+        let mut steps = good.steps().to_vec();
+        spoil(&mut steps);
+        for step in steps {
             send(&worker, step).await;
         }
-        let error = send_commit(&worker, &request).await.unwrap_err();
+        let error = send_commit(&worker, &commit(&good)).await.unwrap_err();
         assert_eq!((error.code, error.field.as_str()), (Code::InvalidArgument, field));
     }
     worker.put(key::demonstration_step("reach-1", "0").unwrap(), [0xff; 9].as_slice()).await.unwrap();
-    assert_eq!(send_commit(&worker, &request).await.unwrap(), [0, 1, 2], "what was refused is forgotten");
-    for number in 0..3 {
-        send(&worker, step(&request, number)).await;
+    assert_eq!(send_commit(&worker, &commit(&good)).await.unwrap(), [0, 1, 2], "what was refused is forgotten");
+    replay::send(&worker, &good).await.unwrap();
+
+    let mut steps = steps("reach", 2, 3);
+    for step in &mut steps {
+        step.frame = step.frame.clone().rendered_as("other").unwrap();
     }
-    assert!(send_commit(&worker, &request).await.unwrap().is_empty());
-    trainer.shutdown().await.unwrap();
+    let other = Episode::new(info("reach", 2, &steps), steps).unwrap();
+    let error = replay::send(&worker, &other).await.unwrap_err();
+    assert_eq!(error, Error::new(Code::FailedPrecondition, "frame.render_spec", common::SPEC, "other"));
+    assert_eq!(files(folder.path()).len(), 1);
+}
+
+/// One place, six senders at once: five wait at any time, and their steps are dropped.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorder_that_cannot_keep_up_loses_nothing_for_good() {
+    let folder = tempfile::tempdir().unwrap();
+    let (trainer, worker) = sessions("tcp/127.0.0.1:17453").await;
+    let limits = Limits { episodes: 1, silence: Duration::MAX };
+    let (_recorder, recordings) = record(&trainer, folder.path(), limits).await;
+    let episodes: Vec<_> = (0..6).map(|seed| episode("reach", seed, 12)).collect();
+    let mut senders = JoinSet::new();
+    for episode in episodes.clone() {
+        let worker = worker.clone();
+        senders.spawn(async move { replay::send(&worker, &episode).await });
+    }
+    while let Some(sent) = senders.join_next().await {
+        sent.unwrap().unwrap();
+    }
+    for episode in episodes {
+        assert_eq!(recordings.read(&episode.info().episode_id).unwrap(), Some(episode));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_episode_that_fell_silent_makes_room() {
+    let folder = tempfile::tempdir().unwrap();
+    let (trainer, worker) = sessions("tcp/127.0.0.1:17454").await;
+    let (_recorder, _) = record(&trainer, folder.path(), Limits { episodes: 1, silence: Duration::ZERO }).await;
+    assert_eq!(send_commit(&worker, &commit(&episode("reach", 1, 2))).await.unwrap(), [0, 1]);
+    replay::send(&worker, &episode("reach", 2, 2)).await.unwrap();
+}
+
+/// What a subscriber missed, it can ask for: the same bytes at the same keys.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_kept_is_announced_listed_and_sent_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let (trainer, worker) = sessions("tcp/127.0.0.1:17455").await;
+    let announced = trainer.declare_subscriber(key::demonstration_recorded("*").unwrap()).await.unwrap();
+    let streamed = trainer.declare_subscriber(key::demonstration_step("*", "*").unwrap()).await.unwrap();
+    let (recorder, _) = record(&trainer, folder.path(), Limits::default()).await;
+    let (first, second) = (episode("reach", 1, 3), episode("push", 2, 4));
+    replay::send(&worker, &first).await.unwrap();
+    let mut stream: Vec<_> =
+        streamed.drain().map(|s| (s.key_expr().to_string(), s.payload().to_bytes().to_vec())).collect();
+    replay::send(&worker, &second).await.unwrap();
+    for episode in [&first, &second] {
+        let sample = announced.recv_async().await.unwrap();
+        let key = key::demonstration_recorded(&episode.info().episode_id).unwrap();
+        assert_eq!(sample.key_expr().as_str(), key.as_str());
+        assert_eq!(decode::<RecordedEpisode>(&sample.payload().to_bytes()).unwrap(), *episode.info());
+    }
+
+    // A recorder that starts anew knows what was kept before.
+    drop(recorder);
+    let (_recorder, _) = record(&trainer, folder.path(), Limits::default()).await;
+    let list = |episode: &str| {
+        let (key, worker) = (key::demonstration_recorded(episode).unwrap(), worker.clone());
+        async move { query::collect::<RecordedEpisode>(&worker, &key, 9, Duration::from_secs(10)).await }
+    };
+    while list("*").await.unwrap().is_empty() {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    assert_eq!(list("*").await.unwrap(), [second.info().clone(), first.info().clone()]);
+    assert_eq!(list("reach-1").await.unwrap(), [first.info().clone()]);
+    assert!(list("reach-7").await.unwrap().is_empty());
+
+    let replies = worker.get(key::demonstration_step("reach-1", "*").unwrap()).await.unwrap();
+    let mut again = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let sample = reply.into_result().unwrap();
+        again.push((sample.key_expr().to_string(), sample.payload().to_bytes().to_vec()));
+    }
+    again.sort();
+    stream.sort();
+    assert_eq!(again, stream);
+    let one = key::demonstration_step("push-2", "3").unwrap();
+    let answer = query::collect::<DemonstrationStep>(&worker, &one, 9, Duration::from_secs(10)).await.unwrap();
+    assert_eq!(answer, second.steps()[3..]);
+    let all = key::demonstration_step("*", "*").unwrap();
+    let error = query::collect::<DemonstrationStep>(&worker, &all, 9, Duration::from_secs(10)).await.unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (Code::InvalidArgument, "key"));
+}
+
+#[test]
+fn a_folder_is_taken_over_as_it_was_left() {
+    let folder = tempfile::tempdir().unwrap();
+    common::keep(folder.path(), &episode("reach", 1, 3));
+    let task = folder.path().join("reach");
+    std::fs::write(task.join(".unfinished-abc"), "half").unwrap();
+    std::fs::write(task.join("reach-2.mcap"), "no recording").unwrap();
+    let recordings = Recordings::open(folder.path().to_owned()).unwrap();
+    assert!(!task.join(".unfinished-abc").exists());
+    assert_eq!(recordings.all(), [episode("reach", 1, 3).info().clone()]);
+    recordings.keep(&episode("reach", 2, 3)).unwrap();
+    assert_eq!(recordings.read("reach-2").unwrap(), Some(episode("reach", 2, 3)), "takes the place of the faulty file");
 }

@@ -12,7 +12,13 @@ use wire::planner::ModelInfo;
 
 fn publish(folder: &Path, seed: u64) -> String {
     let agent = Agent::new(ModelConfig::paper(MethodKind::TeBc), seed);
-    let provenance = Provenance { training_tasks: vec!["reach".into()], data_digest: String::new(), seed, epochs: 1 };
+    let provenance = Provenance {
+        training_tasks: vec!["reach".into()],
+        data_digest: String::new(),
+        render_spec: String::new(),
+        seed,
+        epochs: 1,
+    };
     let bytes = checkpoint::to_bytes(&agent, &provenance).unwrap();
     files::write_atomically(&folder.join("te-bc.safetensors"), &bytes).unwrap();
     checkpoint::digest(&bytes)

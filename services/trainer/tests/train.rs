@@ -4,8 +4,9 @@
 
 mod common;
 
-use common::{commit, keep};
+use common::{SPEC, episode, info, keep, steps};
 use cpn::{EncoderConfig, EncoderPreset, MethodKind, checkpoint};
+use recording::Episode;
 use std::path::Path;
 use trainer::train::{self, Config, Outcome};
 
@@ -13,7 +14,7 @@ fn config(folder: &Path, name: &str) -> Config {
     let dataset = folder.join("data");
     if !dataset.exists() {
         for (task, seed, steps) in [("reach", 1, 9), ("reach", 2, 7), ("door-lock", 1, 8)] {
-            keep(&dataset, &commit(task, seed, steps));
+            keep(&dataset, &episode(task, seed, steps));
         }
     }
     let out = folder.join(format!("{name}.safetensors"));
@@ -62,6 +63,7 @@ fn the_checkpoint_tells_where_it_comes_from() {
         assert_eq!(loaded.provenance.training_tasks, ["reach"]);
         assert_eq!((loaded.provenance.seed, loaded.provenance.epochs), (4, 1));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
+        assert_eq!(loaded.provenance.render_spec, SPEC);
     }
 }
 
@@ -107,10 +109,22 @@ fn bad_input_is_named() {
     let message = refused(&Config { batch_size: 0, ..good.clone() });
     assert!(message.contains("batch_size"), "{message}");
 
-    let episode = good.dataset.join("reach/reach-1.safetensors");
-    let bytes = std::fs::read(&episode).unwrap();
-    std::fs::write(&episode, &bytes[..bytes.len() / 2]).unwrap();
+    let mut others = steps("reach", 3, 4);
+    for step in &mut others {
+        step.frame = step.frame.clone().rendered_as("other").unwrap();
+    }
+    let other = Episode::new(info("reach", 3, &others), others).unwrap();
+    let path = good.dataset.join("reach/reach-3.mcap");
+    std::fs::write(&path, recording::to_bytes(&other).unwrap()).unwrap();
     let message = refused(&good);
-    assert!(message.contains("reach-1.safetensors") && message.contains("safetensors:"), "{message}");
+    let mixed = format!("render_spec: expected {SPEC:?} like the episodes before, got \"other\"");
+    assert!(message.contains("reach-3.mcap") && message.contains(&mixed), "{message}");
+    std::fs::remove_file(path).unwrap();
+
+    let path = good.dataset.join("reach/reach-1.mcap");
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let message = refused(&good);
+    assert!(message.contains("reach-1.mcap") && message.contains("recording:"), "{message}");
     assert!(!good.out.exists());
 }

@@ -174,7 +174,8 @@ pub fn image(seed: u64) -> proto::Image {
         state ^= state << 17;
         state as u8
     });
-    proto::Image { height: 84, width: 84, format: proto::PixelFormat::Rgb8.into(), data: data.collect() }
+    let format = proto::PixelFormat::Rgb8.into();
+    proto::Image { height: 84, width: 84, format, data: data.collect(), render_spec: String::new() }
 }
 
 /// A plan from the image `seed` to the image 0.
@@ -204,8 +205,13 @@ pub fn from_file(model: &str, file: &str) -> proto::LoadModelRequest {
     proto::LoadModelRequest { model: model.into(), source: Some(proto::load_model_request::Source::File(file.into())) }
 }
 
-/// A checkpoint of few, random weights.
+/// A checkpoint of few, random weights, trained on pictures of unknown origin.
 pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
+    checkpoint_for(method, seed, "")
+}
+
+/// A checkpoint of few, random weights, trained on pictures that were rendered in one way.
+pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u8> {
     let encoder = EncoderConfig {
         convolutions: vec![
             ConvConfig { channels: 3, kernel: 8, stride: 8 },
@@ -216,7 +222,8 @@ pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
     };
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
-    let provenance = Provenance { training_tasks, data_digest: "d".into(), seed, epochs: 1 };
+    let provenance =
+        Provenance { training_tasks, data_digest: "d".into(), render_spec: render_spec.into(), seed, epochs: 1 };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
 
@@ -311,7 +318,7 @@ pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
         training_tasks: Vec::new(),
         horizon: 1,
     };
-    core.serve(Model { info, method }).await.unwrap();
+    core.serve(Model { info, render_spec: String::new(), method }).await.unwrap();
 }
 
 pub fn is(code: Code, field: &str, result: Result<PlanResponse, Error>) {

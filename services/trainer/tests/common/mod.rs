@@ -5,32 +5,91 @@
 use cpn::images;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use recording::Episode;
+use service_kit::SessionConfig;
 use std::path::Path;
-use trainer::ingest::Ingest;
+use std::sync::Arc;
+use trainer::recordings::Recordings;
 use wire::Image;
-use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
+use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpisode, digest};
 use wire::sim::Variation;
+use zenoh::Session;
 
-/// The commit of an episode with `steps` steps.
-pub fn commit(task: &str, seed: u64, steps: u32) -> CommitEpisodeRequest {
-    let variation = Variation { task: task.to_owned(), seed };
-    CommitEpisodeRequest { episode_id: format!("{task}-{seed}"), variation, steps }
-}
+/// How every frame says it was rendered.
+pub const SPEC: &str = r#"{"camera":"corner2"}"#;
 
 /// Step `step` of an episode: noise, and an action except at the end.
-pub fn step(commit: &CommitEpisodeRequest, step: u32) -> DemonstrationStep {
-    let mut rng = ChaCha8Rng::seed_from_u64(commit.variation.seed * 1000 + u64::from(step));
+pub fn step(task: &str, seed: u64, steps: u32, step: u32) -> DemonstrationStep {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + u64::from(step));
     let mut data = vec![0; images::BYTES];
     rng.fill_bytes(&mut data);
     let side = images::SIZE as u32;
-    let frame = Image::new(side, side, data).unwrap();
-    let action = (step + 1 < commit.steps).then(|| (0..4).map(|_| rng.random_range(-1.0..1.0)).collect());
-    DemonstrationStep { episode_id: commit.episode_id.clone(), step, frame, action }
+    DemonstrationStep {
+        episode_id: format!("{task}-{seed}"),
+        step,
+        frame: Image::new(side, side, data).unwrap().rendered_as(SPEC).unwrap(),
+        action: (step + 1 < steps).then(|| (0..4).map(|_| rng.random_range(-1.0..1.0)).collect()),
+        state: vec![step as f32 * 0.01, 0.5, 0.2],
+        reward: step as f32,
+        success: step + 1 == steps,
+    }
+}
+
+/// All steps of an episode.
+pub fn steps(task: &str, seed: u64, count: u32) -> Vec<DemonstrationStep> {
+    (0..count).map(|number| step(task, seed, count, number)).collect()
+}
+
+/// What is said of an episode of these steps.
+pub fn info(task: &str, seed: u64, steps: &[DemonstrationStep]) -> RecordedEpisode {
+    RecordedEpisode {
+        episode_id: format!("{task}-{seed}"),
+        variation: Variation { task: task.to_owned(), seed },
+        steps: steps.len() as u32,
+        digest: digest(steps),
+        goal_position: Vec::new(),
+        control_hz: 80.0,
+    }
+}
+
+/// An episode with `count` steps.
+pub fn episode(task: &str, seed: u64, count: u32) -> Episode {
+    let steps = steps(task, seed, count);
+    Episode::new(info(task, seed, &steps), steps).unwrap()
+}
+
+/// The request that closes an episode.
+pub fn commit(episode: &Episode) -> CommitEpisodeRequest {
+    CommitEpisodeRequest { episode: episode.info().clone() }
 }
 
 /// Keeps an episode in `folder`.
-pub fn keep(folder: &Path, commit: &CommitEpisodeRequest) {
-    let ingest = Ingest::new(folder.to_owned());
-    (0..commit.steps).for_each(|number| ingest.step(step(commit, number)));
-    assert!(ingest.commit(commit).unwrap().missing_steps.is_empty());
+pub fn keep(folder: &Path, episode: &Episode) {
+    Recordings::open(folder.to_owned()).unwrap().keep(episode).unwrap();
+}
+
+/// A session that listens, and one that connects to it.
+pub async fn sessions(endpoint: &str) -> (Session, Session) {
+    let listening = SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() };
+    let connecting = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
+    let listening = service_kit::session::open(&listening).await.unwrap();
+    (listening, service_kit::session::open(&connecting).await.unwrap())
+}
+
+/// Every recording of a folder, as bytes by path below it.
+pub fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
+    let paths = trainer::recordings::paths(folder).unwrap();
+    let name = |path: &Path| path.strip_prefix(folder).unwrap().display().to_string();
+    paths.iter().map(|path| (name(path), std::fs::read(path).unwrap())).collect()
+}
+
+/// A recorder of `folder` on a session.
+pub async fn record(
+    session: &Session,
+    folder: &Path,
+    limits: trainer::ingest::Limits,
+) -> (trainer::recorder::Recorder, Arc<Recordings>) {
+    let recordings = Arc::new(Recordings::open(folder.to_owned()).unwrap());
+    let ingest = Arc::new(trainer::ingest::Ingest::new(Arc::clone(&recordings), limits));
+    (trainer::recorder::start(session, Arc::clone(&recordings), ingest).await.unwrap(), recordings)
 }

@@ -1,0 +1,90 @@
+//! A late joiner: fetches what other recorders keep, then follows them.
+
+use crate::ingest::check_same;
+use crate::recordings::Recordings;
+use crate::replay::{is_passing, patience};
+use backon::Retryable;
+use recording::Episode;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::Notify;
+use tracing::{info, warn};
+use wire::demonstration::{DemonstrationStep, MAX_STEPS, RecordedEpisode};
+use wire::{Code, Error, key, query};
+use zenoh::Session;
+
+/// Most episodes that a network may hold.
+const MAX_EPISODES: usize = 100_000;
+/// How long an answer may take: a list, or the steps of an episode.
+const TIMEOUT: Duration = Duration::from_secs(30);
+/// How often is asked anew, should an announcement be lost.
+const POLL_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Fetches every episode that others keep and `recordings` lacks.
+///
+/// # Errors
+/// If nobody tells of any episode for two minutes, or one cannot be fetched, or differs from what is kept here.
+pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(), Error> {
+    let attempt = || async {
+        match pass(session, recordings).await?.offered {
+            0 => Err(Error::new(Code::Unavailable, "episodes", "a recorder that keeps some", "none")),
+            _ => Ok(()),
+        }
+    };
+    attempt.retry(patience()).when(is_passing).await
+}
+
+/// Does the same now and whenever an episode is announced, for as long as it is polled.
+///
+/// # Errors
+/// If zenoh refuses a declaration.
+pub async fn follow(session: &Session, recordings: &Arc<Recordings>) -> zenoh::Result<()> {
+    let announced = Arc::new(Notify::new());
+    let notify = Arc::clone(&announced);
+    let _announcements =
+        session.declare_subscriber(key::demonstration_recorded("*")?).callback(move |_| notify.notify_one()).await?;
+    loop {
+        match pass(session, recordings).await {
+            Ok(Pass { offered, fetched }) if fetched > 0 => info!(offered, fetched, "mirrored"),
+            Ok(_) => {}
+            Err(error) => warn!(%error, "not mirrored; tried again"),
+        }
+        // Elapsing is as good as being told.
+        let _ = tokio::time::timeout(POLL_INTERVAL, announced.notified()).await;
+    }
+}
+
+struct Pass {
+    offered: usize,
+    fetched: usize,
+}
+
+/// Asks what is kept and fetches what is lacking; one episode that fails does not keep the others away.
+async fn pass(session: &Session, recordings: &Arc<Recordings>) -> Result<Pass, Error> {
+    let key = key::demonstration_recorded("*")?;
+    let offered: Vec<RecordedEpisode> = query::collect(session, &key, MAX_EPISODES, TIMEOUT).await?;
+    let mut failed = None;
+    let mut pass = Pass { offered: offered.len(), fetched: 0 };
+    for episode in offered {
+        let id = episode.episode_id.clone();
+        let result = match recordings.get(&id) {
+            Some(kept) => check_same(&kept, &episode),
+            None => fetch(session, recordings, episode).await.map(|()| pass.fetched += 1),
+        };
+        failed = result.map_err(|e| e.within(&id)).err().or(failed);
+    }
+    failed.map_or(Ok(pass), Err)
+}
+
+/// Fetches one episode; it is kept only if it has the digest that was announced.
+async fn fetch(session: &Session, recordings: &Arc<Recordings>, info: RecordedEpisode) -> Result<(), Error> {
+    let key = key::demonstration_step(&info.episode_id, "*")?;
+    let steps: Vec<DemonstrationStep> = query::collect(session, &key, 4 * MAX_STEPS as usize, TIMEOUT).await?;
+    // Several recorders may have answered.
+    let steps: BTreeMap<u32, DemonstrationStep> = steps.into_iter().map(|step| (step.step, step)).collect();
+    let recordings = Arc::clone(recordings);
+    let keeping =
+        tokio::task::spawn_blocking(move || recordings.keep(&Episode::new(info, steps.into_values().collect())?));
+    keeping.await.map_err(|e| Error::new(Code::Internal, "episode_id", "a kept episode", e))?
+}

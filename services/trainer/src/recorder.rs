@@ -1,0 +1,122 @@
+//! The recorder over zenoh: takes in streams, tells what it keeps, and sends it again to whoever asks.
+
+use crate::ingest::{Commit, Ingest};
+use crate::recordings::Recordings;
+use std::sync::Arc;
+use tokio::runtime::Handle;
+use tokio::sync::Semaphore;
+use tracing::warn;
+use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse};
+use wire::{Code, Error, encode, key, query};
+use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::pubsub::Subscriber;
+use zenoh::query::{Query, Queryable};
+use zenoh::{Session, Wait};
+
+/// Queries of one kind that are answered or wait for it at the same time; each holds an episode at most.
+const PLACES: usize = 16;
+
+/// What makes a recorder; it stops when this is dropped.
+#[derive(Debug)]
+pub struct Recorder {
+    _steps: Subscriber<()>,
+    _queryables: [Queryable<()>; 3],
+}
+
+/// Starts to keep what is streamed, and to offer what is kept.
+///
+/// # Errors
+/// If zenoh refuses a declaration.
+pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<Ingest>) -> zenoh::Result<Recorder> {
+    let (listed, read) = (Arc::clone(&recordings), recordings);
+    let list = serve(session, key::demonstration_recorded("*")?, move |query| list(&listed, query)).await?;
+    let send = serve(session, key::demonstration_step("*", "*")?, move |query| send(&read, query)).await?;
+    let receiver = Arc::clone(&ingest);
+    // The callback only copies a frame. It must be done before the next message is read: a commit follows its steps.
+    let steps = session
+        .declare_subscriber(key::demonstration_step("*", "*")?)
+        .callback(move |sample| match wire::decode(&sample.payload().to_bytes()) {
+            Ok(step) => receiver.step(step),
+            Err(error) => warn!(key = %sample.key_expr(), %error, "step refused"),
+        })
+        .await?;
+    let announcer = session.clone();
+    let commit =
+        serve(session, key::demonstration_commit("*")?, move |query| commit(&announcer, &ingest, query)).await?;
+    Ok(Recorder { _steps: steps, _queryables: [list, send, commit] })
+}
+
+/// Answers queries on threads that may read and write files; zenoh's callback only starts them. Recorders hold
+/// different episodes, so none is complete.
+async fn serve(
+    session: &Session,
+    key: OwnedKeyExpr,
+    answer: impl Fn(&Query) -> zenoh::Result<()> + Send + Sync + 'static,
+) -> zenoh::Result<Queryable<()>> {
+    let (places, runtime, answer) = (Arc::new(Semaphore::new(PLACES)), Handle::current(), Arc::new(answer));
+    let callback = move |query: Query| {
+        let (place, answer) = (Arc::clone(&places).try_acquire_owned(), Arc::clone(&answer));
+        runtime.spawn_blocking(move || {
+            let answered = match place {
+                Ok(_place) => answer(&query),
+                Err(_) => {
+                    let got = format!("{PLACES} waiting");
+                    query::refuse(&query, Error::new(Code::ResourceExhausted, "queue", "a free place", got))
+                }
+            };
+            if let Err(error) = answered {
+                warn!(key = %query.key_expr(), %error, "answer not sent");
+            }
+        });
+    };
+    session.declare_queryable(key).callback(callback).await
+}
+
+fn commit(session: &Session, ingest: &Ingest, query: &Query) -> zenoh::Result<()> {
+    let request: Result<CommitEpisodeRequest, Error> = query::request(query);
+    let commit = request.and_then(|request| Ok((ingest.commit(&request)?, request)));
+    let missing_steps = match commit {
+        Ok((Commit::Missing(steps), _)) => steps,
+        Ok((Commit::KeptBefore, _)) => Vec::new(),
+        Ok((Commit::Kept, CommitEpisodeRequest { episode })) => {
+            session.put(key::demonstration_recorded(&episode.episode_id)?, encode(episode)).wait()?;
+            Vec::new()
+        }
+        Err(error) => {
+            warn!(key = %query.key_expr(), %error, "commit refused");
+            return query::refuse(query, error);
+        }
+    };
+    query::reply(query, Ok(CommitEpisodeResponse { missing_steps }))
+}
+
+/// Tells of every kept episode that is asked for.
+fn list(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
+    for episode in recordings.all() {
+        let key = key::demonstration_recorded(&episode.episode_id)?;
+        if query.key_expr().intersects(&key) {
+            query::reply_at(query, &key, episode)?;
+        }
+    }
+    Ok(())
+}
+
+/// Sends the steps of one kept episode that are asked for, as they came.
+fn send(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
+    let asked = query.key_expr();
+    let Some(episode_id) = key::episode_of_demonstration_step(asked).filter(|episode| !episode.contains('*')) else {
+        return query::refuse(query, Error::invalid("key", "the steps of one episode", asked));
+    };
+    let episode = match recordings.read(&episode_id) {
+        Ok(episode) => episode,
+        Err(error) => return query::refuse(query, error),
+    };
+    // What is not kept here may be elsewhere.
+    for step in episode.into_iter().flat_map(recording::Episode::into_steps) {
+        let key = key::demonstration_step(&episode_id, &step.step.to_string())?;
+        if asked.intersects(&key) {
+            query::reply_at(query, &key, step)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,165 @@
+//! Reads a whole dataset and says what is in it and what is wrong with it.
+
+use crate::recordings::{self, dataset_digest};
+use anyhow::Context;
+use comfy_table::{CellAlignment, LineStyle, Table, presets};
+use rayon::prelude::*;
+use recording::Episode;
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::Path;
+use wire::demonstration::{DemonstrationStep, RecordedEpisode};
+
+/// A hand that moves farther between two steps must change the picture: a third of what an action moves it at most, and
+/// a quarter of what a pixel shows.
+const VISIBLE_METRES: f32 = 0.005;
+
+/// What is in a dataset, and what is wrong with it.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// One for each task, by name.
+    pub tasks: Vec<TaskReport>,
+    /// As a checkpoint that was trained on all of it names it.
+    pub digest: String,
+    /// Every fault, each with where it is.
+    pub faults: Vec<String>,
+}
+
+/// The episodes of one task.
+#[derive(Debug, Serialize)]
+pub struct TaskReport {
+    /// Name of the task.
+    pub task: String,
+    /// Kept episodes.
+    pub episodes: usize,
+    /// Seeds below the largest kept one, from 0, of which no episode is kept: the expert failed.
+    pub rejected: u64,
+    /// Steps of an episode.
+    pub steps_mean: f64,
+    /// Size of a recording, in bytes.
+    pub bytes_mean: f64,
+}
+
+/// One recording, read and reduced to what the report needs.
+struct Facts {
+    info: RecordedEpisode,
+    render_spec: String,
+    bytes: u64,
+    constant_action: bool,
+    faults: Vec<String>,
+}
+
+/// Reads every recording of `folder`, on every core, one at a time on each. Fewer than `episodes` of a task are a fault.
+///
+/// # Errors
+/// If the folder cannot be read; what is wrong inside it is in the report.
+pub fn run(folder: &Path, episodes: usize) -> anyhow::Result<Report> {
+    let paths = recordings::paths(folder)?;
+    let read: Vec<_> = paths.par_iter().map(|path| facts(path)).collect();
+    let mut by_task: BTreeMap<String, Vec<Facts>> =
+        recordings::tasks(folder)?.into_iter().map(|task| (task, Vec::new())).collect();
+    let mut faults = Vec::new();
+    for (path, facts) in paths.iter().zip(read) {
+        match facts {
+            Ok(facts) => {
+                let place = path.strip_prefix(folder).unwrap_or(path).display();
+                faults.extend(facts.faults.iter().map(|fault| format!("{place}: {fault}")));
+                by_task.entry(facts.info.variation.task.clone()).or_default().push(facts);
+            }
+            Err(fault) => faults.push(format!("{fault:#}")),
+        }
+    }
+    for (task, found) in &by_task {
+        if found.len() < episodes {
+            faults.push(format!("{task}: expected at least {episodes} episodes, got {}", found.len()));
+        }
+        if !found.is_empty() && found.iter().all(|facts| facts.constant_action) {
+            faults.push(format!("{task}: expected actions that change, got constant ones in every episode"));
+        }
+    }
+    let all = || by_task.values().flatten();
+    faults.extend(mixed("render_spec", all().map(|facts| facts.render_spec.clone())));
+    faults.extend(mixed("control_hz", all().map(|facts| facts.info.control_hz.to_string())));
+    if paths.is_empty() {
+        faults.push(format!("{}: expected recordings, got none", folder.display()));
+    }
+    let digest = dataset_digest(all().map(|facts| &facts.info));
+    Ok(Report { tasks: by_task.iter().map(|(task, found)| summarise(task, found)).collect(), digest, faults })
+}
+
+fn facts(path: &Path) -> anyhow::Result<Facts> {
+    let read = || anyhow::Ok((recording::read(path)?, path.metadata()?.len()));
+    let (episode, bytes) = read().with_context(|| path.display().to_string())?;
+    let actions: Vec<_> = episode.steps().iter().filter_map(|step| step.action.as_ref()).collect();
+    Ok(Facts {
+        info: episode.info().clone(),
+        render_spec: episode.render_spec().to_owned(),
+        bytes,
+        constant_action: actions.windows(2).all(|pair| pair[0] == pair[1]),
+        faults: faults(&episode),
+    })
+}
+
+/// What is wrong inside an episode that is whole; that its actions lie in [-1, 1] is checked as it is read.
+fn faults(episode: &Episode) -> Vec<String> {
+    let steps = episode.steps();
+    let mut faults = Vec::new();
+    let same = |pair: &&[DemonstrationStep]| pair[0].frame == pair[1].frame;
+    if steps.windows(2).all(|pair| same(&pair)) {
+        faults.push("expected frames that change, got the same in every step".to_owned());
+    } else {
+        let stuck = steps.windows(2).filter(same).filter_map(|pair| {
+            let moved = hand_moved_metres(&pair[0], &pair[1]).filter(|moved| *moved > VISIBLE_METRES)?;
+            let (before, after) = (pair[0].step, pair[1].step);
+            Some(format!("expected another frame at step {after} than at {before}: the hand moved {moved:.4} m"))
+        });
+        faults.extend(stuck);
+    }
+    if !steps.last().is_some_and(|step| step.success) {
+        faults.push("expected success at the last step, got none".to_owned());
+    }
+    faults
+}
+
+/// How far the hand moved; none if the state does not tell.
+fn hand_moved_metres(before: &DemonstrationStep, after: &DemonstrationStep) -> Option<f32> {
+    let hands = before.state.get(..3)?.iter().zip(after.state.get(..3)?);
+    Some(hands.map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt())
+}
+
+/// A fault if there are several values where there must be one.
+fn mixed(field: &str, values: impl Iterator<Item = String>) -> Option<String> {
+    let values: BTreeSet<String> = values.collect();
+    (values.len() > 1).then(|| format!("{field}: expected one, got {}: {values:?}", values.len()))
+}
+
+fn summarise(task: &str, found: &[Facts]) -> TaskReport {
+    let seeds: BTreeSet<u64> = found.iter().map(|facts| facts.info.variation.seed).collect();
+    let mean = |value: fn(&Facts) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
+    TaskReport {
+        task: task.to_owned(),
+        episodes: found.len(),
+        rejected: seeds.last().map_or(0, |largest| largest - (seeds.len() as u64 - 1)),
+        steps_mean: mean(|facts| facts.info.steps.into()),
+        bytes_mean: mean(|facts| facts.bytes as f64),
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
+        table.set_header(["task", "episodes", "rejected", "steps (mean)", "bytes (mean)"]);
+        for TaskReport { task, episodes, rejected, steps_mean, bytes_mean } in &self.tasks {
+            let (steps, bytes) = (format!("{steps_mean:.1}"), format!("{bytes_mean:.0}"));
+            table.add_row([task.clone(), episodes.to_string(), rejected.to_string(), steps, bytes]);
+        }
+        for column in table.column_iter_mut().skip(1) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        let episodes: usize = self.tasks.iter().map(|task| task.episodes).sum();
+        writeln!(f, "{table}\n\n{episodes} episodes, dataset digest {}", self.digest)?;
+        self.faults.iter().try_for_each(|fault| writeln!(f, "fault: {fault}"))
+    }
+}

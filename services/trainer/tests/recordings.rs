@@ -1,0 +1,156 @@
+//! What else is done with recordings: sent again, copied, checked.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use common::{episode, files, info, keep, record, sessions, steps};
+use recording::Episode;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+use trainer::ingest::Limits;
+use trainer::recordings::Recordings;
+use trainer::{mirror, replay, verify};
+use wire::demonstration::{DemonstrationStep, RecordedEpisode};
+use wire::{Code, Image};
+
+fn dataset(folder: &Path) {
+    for (task, seed, steps) in [("push", 0, 4), ("reach", 0, 3), ("reach", 2, 5)] {
+        keep(folder, &episode(task, seed, steps));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_replayed_dataset_is_the_same_to_the_byte() {
+    let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    dataset(from.path());
+    let (trainer, sender) = sessions("tcp/127.0.0.1:17471").await;
+    let _recorder = record(&trainer, to.path(), Limits::default()).await;
+    replay::run(&sender, from.path(), &["push".to_owned()]).await.unwrap();
+    assert_eq!(files(to.path()), files(from.path())[..1], "one task");
+    for _ in 0..2 {
+        replay::run(&sender, from.path(), &[]).await.unwrap();
+        assert_eq!(files(to.path()), files(from.path()));
+    }
+    let error = replay::run(&sender, from.path(), &["pull".to_owned()]).await.unwrap_err().to_string();
+    assert_eq!(error, r#"tasks: expected some of ["push", "reach"], got "pull""#);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
+    let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    dataset(from.path());
+    keep(to.path(), &episode("reach", 2, 5));
+    let (trainer, joiner) = sessions("tcp/127.0.0.1:17472").await;
+    let _recorder = record(&trainer, from.path(), Limits::default()).await;
+    let copies = Arc::new(Recordings::open(to.path().to_owned()).unwrap());
+    mirror::once(&joiner, &copies).await.unwrap();
+    assert_eq!(files(to.path()), files(from.path()));
+
+    let following = {
+        let (joiner, copies) = (joiner.clone(), Arc::clone(&copies));
+        tokio::spawn(async move { mirror::follow(&joiner, &copies).await })
+    };
+    for seed in 3..6 {
+        replay::send(&joiner, &episode("reach", seed, 4)).await.unwrap();
+    }
+    let caught_up = async {
+        while copies.all().len() < 6 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(60), caught_up).await.expect("the new episodes to be mirrored");
+    following.abort();
+    assert_eq!(files(to.path()), files(from.path()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_mirror_keeps_no_other_episode_under_the_same_id() {
+    let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    dataset(from.path());
+    keep(to.path(), &episode("reach", 2, 7));
+    let (trainer, joiner) = sessions("tcp/127.0.0.1:17473").await;
+    let _recorder = record(&trainer, from.path(), Limits::default()).await;
+    let copies = Arc::new(Recordings::open(to.path().to_owned()).unwrap());
+    let error = mirror::once(&joiner, &copies).await.unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (Code::FailedPrecondition, "reach-2.digest"));
+    assert_eq!(copies.read("reach-2").unwrap(), Some(episode("reach", 2, 7)), "left as it was");
+    assert_eq!(copies.all().len(), 3, "the others are copied all the same");
+}
+
+#[test]
+fn verify_tells_what_is_in_a_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let report = verify::run(folder.path(), 1).unwrap();
+    assert_eq!(report.faults, [String::new(); 0]);
+    let rows: Vec<_> = report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.rejected, t.steps_mean)).collect();
+    assert_eq!(rows, [("push", 1, 0, 4.0), ("reach", 2, 1, 4.0)]);
+    assert_eq!(report.digest, trainer::dataset::Dataset::load(folder.path(), &[]).unwrap().digest());
+    let text = report.to_string();
+    assert!(text.contains("reach") && text.contains(&report.digest), "{text}");
+}
+
+/// The faults of a dataset into which one has been planted.
+fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>)) -> Vec<String> {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let mut steps = steps("reach", 3, 4);
+    let mut info = info("reach", 3, &steps);
+    plant(&mut info, &mut steps);
+    info.digest = wire::demonstration::digest(&steps);
+    let bytes = recording::to_bytes(&Episode::new(info, steps).unwrap()).unwrap();
+    std::fs::write(folder.path().join("reach/reach-3.mcap"), bytes).unwrap();
+    verify::run(folder.path(), 1).unwrap().faults
+}
+
+#[test]
+fn verify_finds_what_is_wrong_inside_an_episode() {
+    let place = "reach/reach-3.mcap: ";
+    assert_eq!(faults(|_, _| ()), [String::new(); 0], "nothing is wrong before it is planted");
+    let found = faults(|_, steps| steps[2].frame = steps[1].frame.clone());
+    assert_eq!(found, [format!("{place}expected another frame at step 2 than at 1: the hand moved 0.0100 m")]);
+    let found = faults(|_, steps| {
+        steps[2].frame = steps[1].frame.clone();
+        steps[2].state = steps[1].state.clone();
+    });
+    assert_eq!(found, [String::new(); 0], "where nothing moves, the picture may stay");
+    let found = faults(|_, steps| {
+        let first = steps[0].frame.clone();
+        steps.iter_mut().for_each(|step| step.frame = first.clone());
+    });
+    assert_eq!(found, [format!("{place}expected frames that change, got the same in every step")]);
+    let found = faults(|_, steps| steps[3].success = false);
+    assert_eq!(found, [format!("{place}expected success at the last step, got none")]);
+    let found = faults(|_, steps| {
+        let real = |frame: &Image| frame.clone().rendered_as("").unwrap();
+        steps.iter_mut().for_each(|step| step.frame = real(&step.frame));
+    });
+    assert!(found.len() == 1 && found[0].starts_with("render_spec: expected one, got 2: {\"\", "), "{found:?}");
+    let found = faults(|info, _| info.control_hz = 40.0);
+    assert_eq!(found, [r#"control_hz: expected one, got 2: {"40", "80"}"#]);
+}
+
+#[test]
+fn verify_finds_what_is_wrong_with_the_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let path = folder.path().join("push/push-0.mcap");
+    let mut bytes = std::fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    let faults = verify::run(folder.path(), 2).unwrap().faults;
+    assert!(faults[0].contains("push-0.mcap: recording: Chunk CRC failed"), "{faults:?}");
+    assert_eq!(faults[1..], ["push: expected at least 2 episodes, got 0"]);
+
+    let mut still = steps("stay", 0, 3);
+    still.iter_mut().filter_map(|step| step.action.as_mut()).for_each(|action| *action = vec![0.0; 4]);
+    std::fs::remove_file(path).unwrap();
+    keep(folder.path(), &Episode::new(info("stay", 0, &still), still).unwrap());
+    let faults = verify::run(folder.path(), 0).unwrap().faults;
+    assert_eq!(faults, ["stay: expected actions that change, got constant ones in every episode"]);
+    let nothing = tempfile::tempdir().unwrap();
+    assert!(verify::run(nothing.path(), 0).unwrap().faults[0].ends_with("expected recordings, got none"));
+}
