@@ -1,0 +1,1 @@
+"""Recorded demonstrations as datasets of other robot-learning tools."""

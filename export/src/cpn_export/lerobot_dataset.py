@@ -1,0 +1,130 @@
+"""Writes recordings as a LeRobotDataset v3."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import create_lerobot_dataset_card
+from PIL import Image
+from tqdm import tqdm
+
+from cpn_export.error import ExportError
+from cpn_export.recording import Episode, Header, read_episode
+
+ARM_STATE = ("hand_x", "hand_y", "hand_z", "gripper")
+"""What the simulators' states begin with."""
+
+DESCRIPTION = """\
+Demonstrations of a scripted expert. `goals/episode-*.png` are the pictures of the finished tasks, one an episode: the
+last frame, which follows the last action and hence is no row. `meta/recordings.json` tells which recording each episode
+was, its task, seed, goal position and digest; `render_spec` in `meta/info.json` how the frames were rendered."""
+
+
+def write_dataset(recordings: Sequence[Header], out: Path) -> None:
+    """Writes `recordings`, one or more that are alike, as a dataset at `out`; it appears whole or not at all.
+
+    Raises:
+        ExportError: If `out` exists, or a recording is faulty or of other sizes than the first.
+    """
+    if out.exists():
+        raise ExportError(f"out: expected a path where nothing is yet, got {out}")
+    partial = out.with_name(f"{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # Of a run that was killed.
+    try:
+        _write(recordings, partial)
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def features(episode: Episode) -> dict[str, dict[str, Any]]:
+    """The features of a dataset of episodes like this one, as LeRobot wants them."""
+    height, width, channels = episode.frames.shape[1:]
+    return {
+        # PNG instead of video: lossless, and at 84 x 84 small enough.
+        "observation.image": {
+            "dtype": "image",
+            "shape": (height, width, channels),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (len(ARM_STATE),), "names": list(ARM_STATE)},
+        "observation.environment_state": {"dtype": "float32", "shape": episode.states.shape[1:], "names": None},
+        "action": {"dtype": "float32", "shape": episode.actions.shape[1:], "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+
+
+def _write(recordings: Sequence[Header], root: Path) -> None:
+    datasets.disable_progress_bars()  # Its own on every episode, beside the one of all episodes.
+    dataset = _create(recordings[0], root)
+    provenance: list[dict[str, Any]] = []
+    try:
+        for index, header in enumerate(tqdm(recordings, unit="episode")):
+            episode = read_episode(header)
+            try:
+                _add(dataset, header, episode)
+            except ValueError as error:
+                raise ExportError(f"{header.path}: expected the sizes of {recordings[0].path}: {error}") from error
+            goal = Path("goals", f"episode-{index:06d}.png")
+            Image.fromarray(episode.frames[-1]).save(root / goal)
+            provenance.append(_provenance(index, header, goal))
+    finally:
+        dataset.finalize()  # Even after an error: its destructor would, and write files anew.
+    shutil.rmtree(root / "images", ignore_errors=True)  # Where LeRobot keeps frames until they are in a Parquet file.
+    (root / "meta" / "recordings.json").write_text(json.dumps(provenance, indent=2) + "\n")
+    card = create_lerobot_dataset_card(dataset_info=dataset.meta.info, dataset_description=DESCRIPTION)
+    card.save(root / "README.md")
+
+
+def _create(first: Header, root: Path) -> LeRobotDataset:
+    episode = read_episode(first)
+    if episode.states.shape[1] < len(ARM_STATE):
+        raise ExportError(
+            f"{first.path}: state: expected {len(ARM_STATE)} values or more, got {episode.states.shape[1]}"
+        )
+    root.parent.mkdir(parents=True, exist_ok=True)
+    dataset = LeRobotDataset.create(
+        repo_id=root.stem,
+        root=root,
+        fps=int(first.control_hz),
+        features=features(episode),
+        use_videos=False,
+        video_backend="pyav",  # Not used, but without a name LeRobot warns that it misses torchcodec.
+    )
+    dataset.meta.info["render_spec"] = first.render_spec
+    (root / "goals").mkdir()
+    return dataset
+
+
+def _add(dataset: LeRobotDataset, header: Header, episode: Episode) -> None:
+    """Adds the T rows of an episode; row t holds what its action led to, which the recording keeps at step t + 1."""
+    for t, action in enumerate(episode.actions):
+        row = {
+            "observation.image": episode.frames[t],
+            "observation.state": episode.states[t, : len(ARM_STATE)],
+            "observation.environment_state": episode.states[t],
+            "action": action,
+            "next.reward": episode.rewards[t + 1, np.newaxis],
+            "next.success": episode.successes[t + 1, np.newaxis],
+            "task": header.task,
+        }
+        dataset.add_frame(row)
+    dataset.save_episode()
+
+
+def _provenance(index: int, header: Header, goal: Path) -> dict[str, Any]:
+    return {
+        "episode_index": index,
+        "episode_id": header.episode_id,
+        "task": header.task,
+        "seed": header.seed,
+        "goal_position": header.goal_position,
+        "digest": header.digest,
+        "goal_image": str(goal),
+    }

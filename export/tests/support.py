@@ -1,0 +1,103 @@
+import hashlib
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message_factory import GetMessages
+from grpc_tools import protoc
+from mcap_protobuf.writer import Writer
+from numpy.typing import NDArray
+
+PROTO = Path(__file__).resolve().parents[2] / "proto"
+SIZE, STATE_SIZE, ACTION_SIZE = 84, 39, 4
+
+
+def _messages() -> dict[str, Any]:
+    with tempfile.NamedTemporaryFile() as file:
+        options = [f"-I{PROTO}", f"--descriptor_set_out={file.name}", "--include_imports"]
+        assert protoc.main(["", *options, "cpn/v1/recording.proto"]) == 0
+        return GetMessages(FileDescriptorSet.FromString(file.read()).file)
+
+
+MESSAGES = _messages()
+
+
+@dataclass
+class Sample:
+    """A recording with random contents, to be changed before it is written."""
+
+    task: str
+    seed: int
+    length: int = 5
+    control_hz: float = 80.0
+    render_spec: str = '{"camera":"corner4"}'
+    state_size: int = STATE_SIZE
+    steps: int | None = None
+    digest: str | None = None
+    last_action: bool = False
+    """Whether the goal frame has an action, which it must not have."""
+    goal_position: tuple[float, ...] = (0.5, 0.25, 0.125)
+    frames: NDArray[np.uint8] = field(init=False)
+    actions: NDArray[np.float32] = field(init=False)
+    states: NDArray[np.float32] = field(init=False)
+    rewards: NDArray[np.float32] = field(init=False)
+    successes: NDArray[np.bool_] = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng([self.seed, *self.task.encode()])
+        count = self.length + 1
+        self.frames = random.integers(0, 256, (count, SIZE, SIZE, 3), np.uint8)
+        self.actions = random.uniform(-1, 1, (self.length, ACTION_SIZE)).astype(np.float32)
+        self.states = random.normal(size=(count, self.state_size)).astype(np.float32)
+        self.rewards = random.uniform(0, 10, count).astype(np.float32)
+        self.rewards[0] = 0
+        self.successes = np.arange(count) >= count - 2
+
+    @property
+    def episode_id(self) -> str:
+        return f"{self.task}-{self.seed}"
+
+    def write(self, dataset: Path) -> Path:
+        path = dataset / self.task / f"{self.episode_id}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        actions = [*self.actions, np.ones(ACTION_SIZE, np.float32) if self.last_action else np.empty(0, np.float32)]
+        digest = hashlib.sha256()
+        for t, action in enumerate(actions):
+            for part in (self.frames[t], action, self.states[t], self.rewards[t], self.successes[t]):
+                digest.update(part.tobytes())
+        header = MESSAGES["cpn.v1.EpisodeHeader"](
+            episode_id=self.episode_id,
+            variation={"task": self.task, "seed": self.seed},
+            render_spec=self.render_spec,
+            goal_position=self.goal_position,
+            steps=len(actions) if self.steps is None else self.steps,
+            digest=self.digest or digest.hexdigest(),
+            control_hz=self.control_hz,
+        )
+        with path.open("wb") as file, Writer(file) as writer:
+            writer.write_message("/episode", header, log_time=0, publish_time=0)
+            for t, action in enumerate(actions):
+                time = round(t * 1e9 / self.control_hz)
+                frame = RawImage(
+                    frame_id="camera",
+                    width=SIZE,
+                    height=SIZE,
+                    encoding="rgb8",
+                    step=SIZE * 3,
+                    data=self.frames[t].tobytes(),
+                )
+                frame.timestamp.FromNanoseconds(time)
+                step = MESSAGES["cpn.v1.RecordedStep"](
+                    step=t,
+                    action={"values": action} if len(action) else None,
+                    state=self.states[t],
+                    reward=self.rewards[t],
+                    success=self.successes[t],
+                )
+                writer.write_message("/camera", frame, log_time=time, publish_time=time)
+                writer.write_message("/step", step, log_time=time, publish_time=time)
+        return path
