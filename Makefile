@@ -4,13 +4,14 @@ SHELL := bash
 TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
+EXPORT := export/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo models test lint format clean
+.PHONY: help setup system build demo dataset models test test-crash test-export export-lerobot bench-sim lint format clean
 
 help: ## Show the verbs
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 setup: system .libtorch/build-version $(WORKER)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
 
@@ -25,7 +26,11 @@ $(UV): | system
 	PATH="$(TOOLS)/bin:$$PATH" scripts/setup-libtorch.sh
 
 $(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/scripts/generate_proto.py $(wildcard proto/cpn/v1/*.proto) | $(UV)
-	cd sim-worker && $(UV) sync --quiet --locked --extra grpc && $(UV) run --quiet scripts/generate_proto.py
+	cd sim-worker && $(UV) sync --quiet --locked --all-extras && $(UV) run --quiet scripts/generate_proto.py
+	touch $@
+
+$(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
+	cd export && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -34,6 +39,9 @@ build: setup ## Compile the services
 demo: build ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
 	scripts/demo.sh
 
+dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check them (EPISODES=n for fewer)
+	scripts/dataset.sh
+
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
@@ -41,15 +49,27 @@ test: setup ## Everything that must pass
 	cargo test --workspace --locked
 	cd sim-worker && $(UV) run --quiet pytest
 
+test-crash: setup ## Kill the recorder a hundred times
+	cargo test --locked -p trainer --test crash -- --ignored
+
+test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
+	cd export && $(UV) run --quiet pytest
+
+export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (OUT=folder)
+	$(EXPORT)/bin/cpn-export-lerobot --dataset data/demonstrations --out $(or $(OUT),data/lerobot)
+
+bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
+	cd sim-worker && $(UV) run --quiet --locked --all-extras --group bench ../benches/sim.py
+
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples && $(UV) run --quiet ruff format --check . ../examples && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches && $(UV) run --quiet ruff format --check . ../examples ../benches && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
-	cd sim-worker && $(UV) run --quiet ruff format
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../export
 
 clean: ## Remove what was built
 	rm -rf target $(WORKER) .libtorch

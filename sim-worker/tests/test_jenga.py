@@ -146,7 +146,7 @@ def test_unknown_task_is_refused() -> None:
 
 @pytest.mark.parametrize(("task", "seed"), [("jenga-poke", -1), ("jenga-poke-offset", FIRST_EVALUATION_SEED - 1)])
 def test_seed_out_of_range_is_refused(task: str, seed: int) -> None:
-    with pytest.raises(ValueError, match=f"seed: expected at least .* for {task}, got {seed}"):
+    with pytest.raises(ValueError, match=f"seed of {task}: expected at least .*, got {seed}"):
         JengaScene(task).reset(seed)
 
 

@@ -83,6 +83,20 @@ def test_goal_of_another_variation(worker: Worker) -> None:
         worker.reset(task, unsolved + 1, goal_seed=unsolved)
 
 
+def test_jenga_is_served_by_the_same_worker(worker: Worker) -> None:
+    start = worker.reset("jenga-poke-offset", SEED)
+    assert len(start.goal_position) == 3
+    assert start.goal.render_spec == start.observation.render_spec != worker.reset().observation.render_spec
+    start = worker.reset("jenga-poke-offset", SEED)
+    with pytest.raises(RequestError, match=r"INVALID_ARGUMENT action.values: expected 3 values, got 4"):
+        worker.step(start.episode_id, 0)
+    response = worker.step(start.episode_id, 0, (1, 0, 0))
+    assert -1 < response.reward < 0
+    with pytest.raises(RequestError, match=r"INVALID_ARGUMENT variation.seed: expected at least 1000000, got 3"):
+        worker.reset("jenga-poke-offset", 3)
+    worker.reset()
+
+
 def test_step_is_applied_exactly_once(worker: Worker) -> None:
     up = (0.0, 0.0, 1.0, 0.0)
     once = worker.reset().episode_id

@@ -18,7 +18,7 @@ from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.session import UnavailableError, ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.stream import EpisodeLostError, digest, is_recorded, send_episode
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, check_task
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, SeedError, check_task
 from cpn_sim_worker.wire import RequestError, action_to_proto, image_to_proto
 
 
@@ -113,7 +113,7 @@ def _run_tasks(
                     except ExpertFailedError:
                         tries.put(Try(task, kept=False))
                     seed += 1
-    except (UnavailableError, RequestError, EpisodeLostError) as error:
+    except (UnavailableError, RequestError, EpisodeLostError, SeedError) as error:
         sys.exit(f"demonstrations stopped: {error}")
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.simulator import Simulator
-from cpn_sim_worker.tasks import UnknownTaskError, check_task
+from cpn_sim_worker.tasks import SeedError, UnknownTaskError, check_task
 from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto, invalid
 
 
@@ -52,6 +52,8 @@ class EpisodeRunner:
         try:
             for _ in solve(self._simulator, task, goal_seed):
                 pass
+        except SeedError as error:
+            raise invalid(field, error.expected, error.got) from None
         except ExpertFailedError as error:
             raise RequestError(
                 types_pb2.ERROR_CODE_FAILED_PRECONDITION,

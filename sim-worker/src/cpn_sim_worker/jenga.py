@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpn_sim_worker.scene import Camera, Transition
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, SeedError
 
 LEVELS = {"jenga-poke": (0,), "jenga-poke-offset": (1, 2)}
 """Levels a task pokes at, of the three whose blocks point at the arm, from below. They are 12 cm apart."""
@@ -103,11 +103,11 @@ class JengaScene:
         start of the hand is uniform in a box, drawn by a PCG64 generator seeded with the task and the seed.
 
         Raises:
-            ValueError: If the seed is negative, or is a demonstration's while the task is for evaluation only.
+            SeedError: If the seed is negative, or is a demonstration's while the task is for evaluation only.
         """
         first = 0 if self._task == "jenga-poke" else FIRST_EVALUATION_SEED
         if seed < first:
-            raise ValueError(f"seed: expected at least {first} for {self._task}, got {seed}")
+            raise SeedError(self._task, f"at least {first}", seed)
         level, column = divmod(seed % (len(LEVELS[self._task]) * COLUMNS), COLUMNS)
         block = self.model.body(f"end_{column}_{LEVELS[self._task][level]}")
         generator = np.random.Generator(np.random.PCG64([zlib.crc32(self._task.encode()), seed]))

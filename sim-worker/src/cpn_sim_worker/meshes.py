@@ -109,9 +109,7 @@ def _simplify(
         left = left[_areas_and_normals(simple, left)[0] > 0]
         if len(left) <= max_faces:
             return simple, left
-    raise ValueError(
-        f"mesh: expected one that can be decimated to {max_faces} faces, got {len(faces)} of which {len(left)} are left"
-    )
+    raise ValueError(f"mesh: expected one that can be decimated to {max_faces} faces, got one of {len(faces)}")
 
 
 def _areas_and_normals(

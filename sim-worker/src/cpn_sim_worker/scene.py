@@ -69,7 +69,11 @@ class Scene(Protocol):
         ...
 
     def reset(self, seed: int) -> NDArray[np.float64]:
-        """Starts the variation that `seed` draws; returns the state, [S]."""
+        """Starts the variation that `seed` draws; returns the state, [S].
+
+        Raises:
+            SeedError: If there is no such variation.
+        """
         ...
 
     def step(self, action: NDArray[np.float32]) -> Transition:

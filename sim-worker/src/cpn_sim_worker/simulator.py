@@ -32,6 +32,7 @@ class Simulator:
 
         Raises:
             UnknownTaskError: If there is no such task.
+            SeedError: If it has no such variation.
         """
         if task != self._task:
             self.scene = _load(task)

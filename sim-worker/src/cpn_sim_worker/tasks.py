@@ -35,6 +35,15 @@ JENGA_TASKS = ("jenga-poke", "jenga-poke-offset")
 FIRST_EVALUATION_SEED = 1_000_000
 
 
+class SeedError(ValueError):
+    """A seed that a task has no variation for."""
+
+    def __init__(self, task: str, expected: str, got: int) -> None:
+        super().__init__(f"seed of {task}: expected {expected}, got {got}")
+        self.expected = expected
+        self.got = got
+
+
 class UnknownTaskError(ValueError):
     """A task that is none of ours."""
 
