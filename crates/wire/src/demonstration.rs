@@ -1,14 +1,13 @@
 //! The demonstration stream, from workers to the trainer, and what a recorder holds of it.
 
-use crate::message::{action, digest as checked_digest, finite, name, position, required};
+use crate::message::{digest as checked_digest, name, position, required};
+use crate::recording::RecordedStep;
 use crate::sim::Variation;
 use crate::{Error, Image, Message, proto};
 use sha2::{Digest, Sha256};
 
 /// Most steps of an episode.
 pub const MAX_STEPS: u32 = 1000;
-/// Most values of a state.
-const MAX_STATE: usize = 1024;
 /// Most actions in a second of simulated time.
 const MAX_CONTROL_HZ: f64 = 10_000.0;
 
@@ -76,24 +75,8 @@ pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> Str
     hex::encode(hasher.finalize())
 }
 
-fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
+pub(crate) fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
     if (min..=max).contains(&value) { Ok(value) } else { Err(Error::invalid(field, format!("{min} to {max}"), value)) }
-}
-
-/// The checked action, state and reward of a step.
-pub(crate) fn motion(
-    raw_action: Option<proto::Action>,
-    state: Vec<f32>,
-    reward: f32,
-) -> Result<(Option<Vec<f32>>, Vec<f32>, f32), Error> {
-    let action = raw_action.map(action).transpose().map_err(|e| e.within("action"))?;
-    if state.len() > MAX_STATE {
-        return Err(Error::invalid("state", format!("at most {MAX_STATE} values"), state.len()));
-    }
-    if !reward.is_finite() {
-        return Err(Error::invalid("reward", "a finite number", reward));
-    }
-    Ok((action, finite("state", state)?, reward))
 }
 
 impl Message for DemonstrationStep {
@@ -104,16 +87,10 @@ impl TryFrom<proto::DemonstrationStep> for DemonstrationStep {
     type Error = Error;
 
     fn try_from(step: proto::DemonstrationStep) -> Result<Self, Error> {
-        let (action, state, reward) = motion(step.action, step.state, step.reward)?;
-        Ok(Self {
-            episode_id: name("episode_id", step.episode_id)?,
-            step: step_count("step", step.step, 0, MAX_STEPS - 1)?,
-            frame: required("frame", step.frame)?,
-            action,
-            state,
-            reward,
-            success: step.success,
-        })
+        let proto::DemonstrationStep { episode_id, step, frame, action, state, reward, success } = step;
+        let episode_id = name("episode_id", episode_id)?;
+        let recorded = RecordedStep::try_from(proto::RecordedStep { step, action, state, reward, success })?;
+        Ok(recorded.with_frame(episode_id, required("frame", frame)?))
     }
 }
 

@@ -1,8 +1,12 @@
 //! What lies beside the frames in a recording.
 
-use crate::demonstration::{DemonstrationStep, RecordedEpisode, motion};
+use crate::demonstration::{DemonstrationStep, MAX_STEPS, RecordedEpisode, step_count};
 use crate::image::render_spec;
+use crate::message::{action, finite};
 use crate::{Error, Image, Message, proto};
+
+/// Most values of a state.
+const MAX_STATE: usize = 1024;
 
 /// What is known of a recorded episode besides its steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,9 +67,19 @@ impl TryFrom<proto::RecordedStep> for RecordedStep {
     type Error = Error;
 
     fn try_from(step: proto::RecordedStep) -> Result<Self, Error> {
-        let proto::RecordedStep { step, action, state, reward, success } = step;
-        let (action, state, reward) = motion(action, state, reward)?;
-        Ok(Self { step, action, state, reward, success })
+        if step.state.len() > MAX_STATE {
+            return Err(Error::invalid("state", format!("at most {MAX_STATE} values"), step.state.len()));
+        }
+        if !step.reward.is_finite() {
+            return Err(Error::invalid("reward", "a finite number", step.reward));
+        }
+        Ok(Self {
+            step: step_count("step", step.step, 0, MAX_STEPS - 1)?,
+            action: step.action.map(action).transpose().map_err(|e| e.within("action"))?,
+            state: finite("state", step.state)?,
+            reward: step.reward,
+            success: step.success,
+        })
     }
 }
 

@@ -191,9 +191,13 @@ mod tests {
             let result = match goal_seed.unwrap_or(variation.seed) {
                 13 => Err(Error::new(Code::FailedPrecondition, "goal_seed", "another", 13)),
                 _ if variation.task == "unknown" => Err(Error::invalid("variation.task", "a task", "unknown")),
-                _ => {
-                    Ok(ResetResponse { episode_id: "e".into(), goal: image(255), observation: image(0), max_steps: 5 })
-                }
+                _ => Ok(ResetResponse {
+                    episode_id: "e".into(),
+                    goal: image(255),
+                    observation: image(0),
+                    max_steps: 5,
+                    goal_position: Vec::new(),
+                }),
             };
             query::reply(query, result).unwrap();
         })

@@ -84,7 +84,7 @@ fn verify_tells_what_is_in_a_dataset() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let report = verify::run(folder.path(), 1).unwrap();
-    assert_eq!(report.faults, [String::new(); 0]);
+    assert_eq!(report.faults, Vec::<String>::new());
     let rows: Vec<_> = report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.rejected, t.steps_mean)).collect();
     assert_eq!(rows, [("push", 1, 0, 4.0), ("reach", 2, 1, 4.0)]);
     assert_eq!(report.digest, trainer::dataset::Dataset::load(folder.path(), &[]).unwrap().digest());
@@ -108,14 +108,14 @@ fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>))
 #[test]
 fn verify_finds_what_is_wrong_inside_an_episode() {
     let place = "reach/reach-3.mcap: ";
-    assert_eq!(faults(|_, _| ()), [String::new(); 0], "nothing is wrong before it is planted");
+    assert_eq!(faults(|_, _| ()), Vec::<String>::new(), "nothing is wrong before it is planted");
     let found = faults(|_, steps| steps[2].frame = steps[1].frame.clone());
     assert_eq!(found, [format!("{place}expected another frame at step 2 than at 1: the hand moved 0.0100 m")]);
     let found = faults(|_, steps| {
         steps[2].frame = steps[1].frame.clone();
         steps[2].state = steps[1].state.clone();
     });
-    assert_eq!(found, [String::new(); 0], "where nothing moves, the picture may stay");
+    assert_eq!(found, Vec::<String>::new(), "where nothing moves, the picture may stay");
     let found = faults(|_, steps| {
         let first = steps[0].frame.clone();
         steps.iter_mut().for_each(|step| step.frame = first.clone());
