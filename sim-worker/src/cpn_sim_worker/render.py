@@ -4,6 +4,7 @@
 # pyright: reportAttributeAccessIssue=false
 
 import copy
+from functools import cache
 from importlib.metadata import version
 from typing import ClassVar
 
@@ -24,6 +25,12 @@ MAX_MESH_FACES = 1000
 
 TESSELLATION = (2, 16, 8)
 """Half of MuJoCo's own quads, slices and stacks: no more than rounding at this size."""
+
+
+@cache
+def _version(package: str) -> str:
+    """The installed version; looking it up takes as long as a frame."""
+    return version(package)
 
 
 class Renderer:
@@ -68,7 +75,7 @@ class Renderer:
             multisamples=0,
             max_mesh_faces=self._max_mesh_faces,
             tessellation=TESSELLATION,
-            versions={package: version(package) for package in packages},
+            versions={package: _version(package) for package in packages},
         )
 
     def _load(self, scene: Scene) -> mujoco.MjrContext:
