@@ -13,4 +13,4 @@ scripts/dataset.sh
 # every step back to the kernel, and takes them anew at the next.
 export MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=4000000000
 printf '%s\n' cpn te-bc | xargs -P "$(nproc)" -I{} target/release/cpn-trainer train --threads 1 \
-  --dataset data/demonstrations --method {} --epochs 2 --hold-out "$held_out" --out models/{}.safetensors
+  --dataset data/demonstrations --method {} --hold-out "$held_out" --out models/{}.safetensors

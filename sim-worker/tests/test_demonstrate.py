@@ -27,7 +27,7 @@ class Trainer:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.steps: defaultdict[str, dict[int, Step]] = defaultdict(dict)
-        self.kept: dict[str, demonstration_pb2.CommitEpisodeRequest] = {}
+        self.kept: dict[str, demonstration_pb2.RecordedEpisode] = {}
         self.received: list[tuple[str, int]] = []
         self.refuse = False
         self._subscriber = session.declare_subscriber(keys.demonstration_step("*", "*"), self._receive)
@@ -47,23 +47,22 @@ class Trainer:
     def _commit(self, query: zenoh.Query) -> None:
         with query:
             assert query.payload is not None
-            request = decode(demonstration_pb2.CommitEpisodeRequest, query.payload.to_bytes())
+            episode = decode(demonstration_pb2.CommitEpisodeRequest, query.payload.to_bytes()).episode
             if self.refuse:
                 error = types_pb2.Error(code=types_pb2.ERROR_CODE_INVALID_ARGUMENT, field="steps")
                 query.reply_err(error.SerializeToString(), encoding=encoding(types_pb2.Error))
                 return
-            missing = [step for step in range(request.steps) if step not in self.steps[request.episode_id]]
+            missing = [step for step in range(episode.steps) if step not in self.steps[episode.episode_id]]
             if not missing:
-                self.kept[request.episode_id] = request
+                self.kept[episode.episode_id] = episode
             response = demonstration_pb2.CommitEpisodeResponse(missing_steps=missing)
-            query.reply(keys.demonstration_commit(request.episode_id), response.SerializeToString())
+            query.reply(keys.demonstration_commit(episode.episode_id), response.SerializeToString())
 
     def _recorded(self, query: zenoh.Query) -> None:
         with query:
             episode_id = str(query.key_expr).split("/")[-2]
             if episode_id in self.kept:
-                recorded = demonstration_pb2.RecordedEpisode(episode_id=episode_id)
-                query.reply(keys.demonstration_recorded(episode_id), recorded.SerializeToString())
+                query.reply(keys.demonstration_recorded(episode_id), self.kept[episode_id].SerializeToString())
 
     def close(self) -> None:
         self._subscriber.undeclare()
@@ -92,18 +91,18 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
     assert set(trainer.kept) == {"reach-5", "reach-6", "coffee-button-5", "coffee-button-6"}
     assert "reach: 2 episodes of 2 tries, 0 rejected" in run.stdout
 
-    request = trainer.kept["reach-5"]
-    assert request.variation == types_pb2.Variation(task="reach", seed=5)
+    episode = trainer.kept["reach-5"]
+    assert episode.variation == types_pb2.Variation(task="reach", seed=5)
     assert trainer.received.count(("reach-5", 3)) > 1
-    steps = [trainer.steps["reach-5"][number] for number in range(request.steps)]
-    assert request.digest == digest(steps)
+    steps = [trainer.steps["reach-5"][number] for number in range(episode.steps)]
+    assert episode.digest == digest(steps)
     arrival = Transition(simulator.reset("reach", 5), reward=0, success=False)
     for number, step in enumerate(steps):
         assert np.array_equal(image_from_proto(step.frame, "frame"), simulator.frame())
         assert step.frame.render_spec == str(simulator.render_spec)
         assert np.array_equal(step.state, arrival.state.astype(np.float32))
         assert (step.reward, step.success) == (np.float32(arrival.reward), arrival.success)
-        assert step.HasField("action") == (number < request.steps - 1)
+        assert step.HasField("action") == (number < episode.steps - 1)
         if step.HasField("action"):
             arrival = simulator.step(action_from_proto(step.action, 4, "action"))
     assert steps[-1].success

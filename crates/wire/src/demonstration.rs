@@ -140,17 +140,13 @@ impl TryFrom<proto::CommitEpisodeRequest> for CommitEpisodeRequest {
     type Error = Error;
 
     fn try_from(request: proto::CommitEpisodeRequest) -> Result<Self, Error> {
-        let proto::CommitEpisodeRequest { episode_id, variation, steps, digest, goal_position, control_hz } = request;
-        let episode = proto::RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz };
-        Ok(Self { episode: episode.try_into()? })
+        Ok(Self { episode: required("episode", request.episode)? })
     }
 }
 
 impl From<CommitEpisodeRequest> for proto::CommitEpisodeRequest {
     fn from(request: CommitEpisodeRequest) -> Self {
-        let proto::RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz } =
-            request.episode.into();
-        Self { episode_id, variation, steps, digest, goal_position, control_hz }
+        Self { episode: Some(request.episode.into()) }
     }
 }
 

@@ -93,7 +93,7 @@ fn an_action_that_is_not_a_number_is_refused() {
 
 #[test]
 fn each_wrong_field_of_a_commit_is_named() {
-    let good = || proto::CommitEpisodeRequest {
+    let good = || proto::RecordedEpisode {
         episode_id: "reach-1".into(),
         variation: Some(proto::Variation { task: "reach".into(), seed: 1 }),
         steps: 2,
@@ -101,22 +101,25 @@ fn each_wrong_field_of_a_commit_is_named() {
         goal_position: Vec::new(),
         control_hz: 10.0,
     };
-    decode::<CommitEpisodeRequest>(&good().encode_to_vec()).unwrap();
-    type Spoil = fn(&mut proto::CommitEpisodeRequest);
+    let decode = |episode| {
+        decode::<CommitEpisodeRequest>(&proto::CommitEpisodeRequest { episode: Some(episode) }.encode_to_vec())
+    };
+    decode(good()).unwrap();
+    type Spoil = fn(&mut proto::RecordedEpisode);
     let cases: [(Spoil, &str, &str); 8] = [
-        (|r| r.steps = 1, "steps", "1"),
-        (|r| r.digest = "ABC".into(), "digest", "\"ABC\""),
-        (|r| r.goal_position = vec![0.0; 2], "goal_position", "2"),
-        (|r| r.goal_position = vec![0.0, 0.0, f32::INFINITY], "goal_position", "inf"),
-        (|r| r.control_hz = 0.0, "control_hz", "0"),
-        (|r| r.control_hz = f64::NAN, "control_hz", "NaN"),
-        (|r| r.control_hz = 10_001.0, "control_hz", "10001"),
-        (|r| r.variation = None, "variation", "none"),
+        (|e| e.steps = 1, "episode.steps", "1"),
+        (|e| e.digest = "ABC".into(), "episode.digest", "\"ABC\""),
+        (|e| e.goal_position = vec![0.0; 2], "episode.goal_position", "2"),
+        (|e| e.goal_position = vec![0.0, 0.0, f32::INFINITY], "episode.goal_position", "inf"),
+        (|e| e.control_hz = 0.0, "episode.control_hz", "0"),
+        (|e| e.control_hz = f64::NAN, "episode.control_hz", "NaN"),
+        (|e| e.control_hz = 10_001.0, "episode.control_hz", "10001"),
+        (|e| e.variation = None, "episode.variation", "none"),
     ];
     for (spoil, field, got) in cases {
-        let mut request = good();
-        spoil(&mut request);
-        let error = decode::<CommitEpisodeRequest>(&request.encode_to_vec()).unwrap_err();
+        let mut episode = good();
+        spoil(&mut episode);
+        let error = decode(episode).unwrap_err();
         assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
     }
 }

@@ -109,7 +109,7 @@ def read_episode(header: Header) -> Episode:
 
 
 def _digest(images: Sequence[Any], steps: Sequence[Any]) -> str:
-    """As `CommitEpisodeRequest.digest` in `proto/cpn/v1/demonstration.proto` has it."""
+    """As `RecordedEpisode.digest` in `proto/cpn/v1/demonstration.proto` has it."""
     digest = hashlib.sha256()
     for image, step in zip(images, steps, strict=True):
         digest.update(image.data)

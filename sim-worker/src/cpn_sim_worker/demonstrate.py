@@ -81,7 +81,7 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
         )
         for number, moment in enumerate(solve(simulator, task, seed))
     ]
-    commit = demonstration_pb2.CommitEpisodeRequest(
+    episode = demonstration_pb2.RecordedEpisode(
         episode_id=episode_id,
         variation=types_pb2.Variation(task=task, seed=seed),
         steps=len(steps),
@@ -89,7 +89,7 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
         goal_position=simulator.scene.goal_position,
         control_hz=simulator.scene.control_hz,
     )
-    send_episode(session, steps, commit)
+    send_episode(session, steps, episode)
 
 
 def _run_tasks(

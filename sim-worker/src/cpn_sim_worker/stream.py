@@ -25,7 +25,7 @@ class EpisodeLostError(Exception):
 
 
 def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
-    """SHA-256 over the steps of an episode, in hex, as `CommitEpisodeRequest.digest` defines it."""
+    """SHA-256 over the steps of an episode, in hex, as `RecordedEpisode.digest` defines it."""
     hasher = hashlib.sha256()
     for step in steps:
         hasher.update(step.frame.data)
@@ -44,7 +44,7 @@ def is_recorded(session: zenoh.Session, episode_id: str) -> bool:
 def send_episode(
     session: zenoh.Session,
     steps: Sequence[demonstration_pb2.DemonstrationStep],
-    commit: demonstration_pb2.CommitEpisodeRequest,
+    episode: demonstration_pb2.RecordedEpisode,
 ) -> None:
     """Sends the steps and commits them, again as long as the trainer misses some.
 
@@ -55,11 +55,12 @@ def send_episode(
         RequestError: If the trainer refuses the episode.
         UnavailableError: If the trainer stays away.
     """
+    commit = demonstration_pb2.CommitEpisodeRequest(episode=episode)
     missing: Collection[int] = range(len(steps))
     for _ in range(MAX_COMMITS):
         for number in missing:
             session.put(
-                keys.demonstration_step(commit.episode_id, number),
+                keys.demonstration_step(episode.episode_id, number),
                 steps[number].SerializeToString(),
                 encoding=encoding(demonstration_pb2.DemonstrationStep),
                 congestion_control=zenoh.CongestionControl.BLOCK,
@@ -67,7 +68,7 @@ def send_episode(
         missing = _commit(session, commit)
         if not missing:
             return
-    raise EpisodeLostError(f"{commit.episode_id}: the trainer still misses steps after {MAX_COMMITS} commits")
+    raise EpisodeLostError(f"{episode.episode_id}: the trainer still misses steps after {MAX_COMMITS} commits")
 
 
 def _may_pass(error: BaseException) -> bool:
@@ -84,6 +85,6 @@ def _may_pass(error: BaseException) -> bool:
 )
 def _commit(session: zenoh.Session, request: demonstration_pb2.CommitEpisodeRequest) -> Collection[int]:
     """The steps that the trainer misses."""
-    key = keys.demonstration_commit(request.episode_id)
+    key = keys.demonstration_commit(request.episode.episode_id)
     response = ask(session, key, request, demonstration_pb2.CommitEpisodeResponse, COMMIT_TIMEOUT_SECONDS)
     return response.missing_steps
