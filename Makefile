@@ -8,7 +8,7 @@ EXPORT := export/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset models test test-crash test-export export-lerobot bench-sim lint format clean
+.PHONY: help setup system build demo dataset models export-lerobot test test-crash test-export bench-sim lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -45,26 +45,26 @@ dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check t
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
+export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (OUT=folder)
+	$(EXPORT)/bin/cpn-export-lerobot --dataset data/demonstrations --out $(or $(OUT),data/lerobot)
+
 test: setup ## Everything that must pass
 	cargo test --workspace --locked
 	cd sim-worker && $(UV) run --quiet pytest
 
 test-crash: setup ## Kill the recorder a hundred times
-	cargo test --locked -p trainer --test crash -- --ignored
+	cargo test --workspace --locked --test crash -- --ignored
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
-	cd export && $(UV) run --quiet pytest
-
-export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (OUT=folder)
-	$(EXPORT)/bin/cpn-export-lerobot --dataset data/demonstrations --out $(or $(OUT),data/lerobot)
+	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
-	cd sim-worker && $(UV) run --quiet --locked --all-extras --group bench ../benches/sim.py
+	cd sim-worker && $(UV) run --quiet ../benches/sim.py
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches && $(UV) run --quiet ruff format --check . ../examples ../benches && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../export && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
@@ -72,4 +72,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../export
 
 clean: ## Remove what was built
-	rm -rf target $(WORKER) .libtorch
+	rm -rf target $(WORKER) $(EXPORT) .libtorch
