@@ -2,7 +2,6 @@
 
 use wire::Error;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
-use wire::recording::EpisodeHeader;
 
 /// T actions with the frames before, between and after them, and what is known of the whole. One that is built is right.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,7 +27,7 @@ impl Episode {
                 check("step", number, step.step)?;
                 check("episode_id", &info.episode_id, &step.episode_id)?;
                 check("frame", size(first), size(step))?;
-                check("frame.render_spec", first.frame.render_spec(), step.frame.render_spec())?;
+                check("frame.render_spec", &*info.render_spec, step.frame.render_spec())?;
                 check("state", values(&first.state), values(&step.state))?;
                 check_action(step, number == last.step, first.action.as_ref().map_or(0, Vec::len))
             };
@@ -51,16 +50,6 @@ impl Episode {
     /// The steps in order, at least 2.
     pub fn into_steps(self) -> Vec<DemonstrationStep> {
         self.steps
-    }
-
-    /// How every frame was rendered; empty for those of a real camera.
-    pub fn render_spec(&self) -> &str {
-        self.steps[0].frame.render_spec()
-    }
-
-    /// What is known of it besides the steps.
-    pub fn header(&self) -> EpisodeHeader {
-        EpisodeHeader { episode: self.info.clone(), render_spec: self.render_spec().to_owned() }
     }
 }
 

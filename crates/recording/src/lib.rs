@@ -1,7 +1,7 @@
 //! Recordings: one demonstrated episode in one MCAP file, which Foxglove, Rerun and every MCAP library can read.
 //!
 //! [`Episode`] is steps that fit together; [`to_bytes`] and [`from_bytes`] are the file. The messages are `RawImage` of
-//! Foxglove's schemas at `/camera` and those of `proto/cpn/v1/recording.proto` beside it.
+//! Foxglove's schemas at `/camera` and those of `proto/cpn/v1/demonstration.proto` beside it.
 
 mod episode;
 mod read;

@@ -10,7 +10,7 @@ use prost::Message as _;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
-use wire::recording::{EpisodeHeader, RecordedStep};
+use wire::demonstration::{RecordedEpisode, RecordedStep};
 use wire::{Error, Image, decode};
 
 /// Why a recording was refused.
@@ -46,12 +46,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Episode, ReadError> {
         return Err(too_large(bytes.len()).into());
     }
     let mut messages = Messages::new(bytes);
-    let EpisodeHeader { episode: info, render_spec } = messages.header()?;
+    let info = messages.header()?;
     let mut steps = Vec::new();
     for number in 0..info.steps {
         let time = log_time_nanos(number, info.control_hz);
         let frame = frame(&messages.of_step(Topic::Camera, number, time)?)
-            .and_then(|frame| frame.rendered_as(&render_spec))
+            .and_then(|frame| frame.rendered_as(&info.render_spec))
             .map_err(|e| e.within(&format!("/camera[{number}]")))?;
         let step: RecordedStep = decode(&messages.of_step(Topic::Step, number, time)?)
             .map_err(|e: Error| e.within(&format!("/step[{number}]")))?;
@@ -79,7 +79,7 @@ pub fn read(path: &Path) -> Result<Episode, ReadError> {
 ///
 /// # Errors
 /// If the file cannot be read, or does not begin with an undamaged header.
-pub fn read_header(path: &Path) -> Result<EpisodeHeader, ReadError> {
+pub fn read_header(path: &Path) -> Result<RecordedEpisode, ReadError> {
     Messages::new(BufReader::new(File::open(path)?)).header()
 }
 
@@ -122,7 +122,7 @@ impl<R: Read> Messages<R> {
         Ok(message)
     }
 
-    fn header(&mut self) -> Result<EpisodeHeader, ReadError> {
+    fn header(&mut self) -> Result<RecordedEpisode, ReadError> {
         let message = self.of(Topic::Episode)?;
         Ok(decode(&message.data).map_err(|e: Error| e.within(Topic::Episode.name()))?)
     }

@@ -16,7 +16,7 @@ pub(crate) const FRAME_ID: &str = "camera";
 /// Which messages are where.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Topic {
-    /// `cpn.v1.EpisodeHeader`, first and once.
+    /// `cpn.v1.RecordedEpisode`, first and once.
     Episode,
     /// `foxglove.RawImage`, before the step of the same time.
     Camera,
@@ -38,7 +38,7 @@ impl Topic {
     /// Full name of the topic's message.
     pub(crate) fn schema_name(self) -> String {
         match self {
-            Self::Episode => proto::EpisodeHeader::full_name(),
+            Self::Episode => proto::RecordedEpisode::full_name(),
             Self::Camera => schema_of_camera().name,
             Self::Step => proto::RecordedStep::full_name(),
         }
@@ -60,7 +60,7 @@ fn schema_of_camera() -> foxglove::Schema {
 /// The two files that recordings need, so that a change of any other leaves recordings as they are.
 fn schema_of_recordings() -> Vec<u8> {
     let mut all = FileDescriptorSet::decode(proto::DESCRIPTORS).expect("the build script encoded them");
-    all.file.retain(|file| matches!(file.name(), "cpn/v1/types.proto" | "cpn/v1/recording.proto"));
+    all.file.retain(|file| matches!(file.name(), "cpn/v1/types.proto" | "cpn/v1/demonstration.proto"));
     all.encode_to_vec()
 }
 

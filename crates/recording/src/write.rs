@@ -8,9 +8,8 @@ use mcap::{McapError, WriteOptions, Writer};
 use prost::Message;
 use std::collections::BTreeMap;
 use std::io::Cursor;
-use wire::demonstration::DemonstrationStep;
+use wire::demonstration::{DemonstrationStep, RecordedStep};
 use wire::proto;
-use wire::recording::RecordedStep;
 
 /// Frames compress against those before them in the same chunk, so that a chunk holds a whole episode of usual length.
 const CHUNK_BYTES: u64 = 4 << 20;
@@ -33,7 +32,7 @@ pub fn to_bytes(episode: &Episode) -> Result<Vec<u8>, McapError> {
     let [episodes, camera, steps] = channels;
     let (episodes, camera, steps) = (episodes?, camera?, steps?);
 
-    write(&mut writer, episodes, 0, 0, &proto::EpisodeHeader::from(episode.header()))?;
+    write(&mut writer, episodes, 0, 0, &proto::RecordedEpisode::from(episode.info().clone()))?;
     // The header has a chunk of its own: whoever wants only that need not decompress a frame.
     writer.flush()?;
     for step in episode.steps() {

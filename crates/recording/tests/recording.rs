@@ -39,6 +39,7 @@ fn info(steps: &[DemonstrationStep]) -> RecordedEpisode {
         digest: digest(steps),
         goal_position: vec![0.0, 0.5, 0.25],
         control_hz: 80.0,
+        render_spec: steps[0].frame.render_spec().to_owned(),
     }
 }
 
@@ -119,7 +120,7 @@ fn the_header_is_read_without_the_rest() {
     let episode = episode(40, 84);
     let bytes = to_bytes(&episode).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    assert_eq!(recording::read_header(&path).unwrap(), episode.header());
+    assert_eq!(recording::read_header(&path).unwrap(), *episode.info());
     assert!(recording::read(&path).is_err());
     std::fs::write(&path, &bytes).unwrap();
     assert_eq!(recording::read(&path).unwrap(), episode);
@@ -179,13 +180,13 @@ fn undamaged_files_that_hold_no_episode_are_refused() {
             refusal(|m| m[1].schema = "sensor_msgs/Image".into()),
             "/camera.schema: expected foxglove.RawImage as protobuf, got sensor_msgs/Image as protobuf",
         ),
-        (refusal(|m| m[0].data = vec![0xff; 9]), "/episode.payload: expected cpn.v1.EpisodeHeader"),
+        (refusal(|m| m[0].data = vec![0xff; 9]), "/episode.payload: expected cpn.v1.RecordedEpisode"),
         (
-            refusal(|m| edit::<proto::EpisodeHeader>(&mut m[0], |header| header.steps = 2)),
+            refusal(|m| edit::<proto::RecordedEpisode>(&mut m[0], |header| header.steps = 2)),
             "steps: expected no message after step 1, got /camera",
         ),
         (
-            refusal(|m| edit::<proto::EpisodeHeader>(&mut m[0], |header| header.digest = "0".repeat(64))),
+            refusal(|m| edit::<proto::RecordedEpisode>(&mut m[0], |header| header.digest = "0".repeat(64))),
             "digest: expected 0000",
         ),
         (refusal(|m| edit::<proto::RecordedStep>(&mut m[4], |step| step.reward = 3.0)), "digest: expected "),
@@ -243,7 +244,7 @@ fn any_mcap_library_reads_it() {
         .collect();
     topics.sort();
     let named =
-        [("/camera", "foxglove.RawImage"), ("/episode", "cpn.v1.EpisodeHeader"), ("/step", "cpn.v1.RecordedStep")];
+        [("/camera", "foxglove.RawImage"), ("/episode", "cpn.v1.RecordedEpisode"), ("/step", "cpn.v1.RecordedStep")];
     assert_eq!(topics, named.map(|(topic, schema)| (topic.to_owned(), schema.to_owned())));
     assert_eq!(summary.stats.unwrap().message_count, 7);
     let frame = MessageStream::new(&bytes).unwrap().map(Result::unwrap).filter(|m| m.channel.topic == "/camera").nth(2);

@@ -17,18 +17,25 @@ const UNFINISHED: &str = ".unfinished-";
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let write = || {
         let folder = path.parent().context("a path without a folder")?;
-        std::fs::create_dir_all(folder)?;
+        if !folder.exists() {
+            std::fs::create_dir_all(folder)?;
+            sync(folder.parent().unwrap_or(folder))?;
+        }
         // Temporary files are private by default; this one becomes an ordinary file, as the umask would have it.
         let ordinary = Permissions::from_mode(0o666);
         let mut file = tempfile::Builder::new().prefix(UNFINISHED).permissions(ordinary).tempfile_in(folder)?;
         file.write_all(bytes)?;
         file.as_file().sync_all()?;
         file.persist(path)?;
-        // The name is the folder's, and lasts when that does; `.` stands for an empty path.
-        File::open(Path::new(".").join(folder))?.sync_all()?;
-        anyhow::Ok(())
+        sync(folder)
     };
     write().with_context(|| format!("writing {}", path.display()))
+}
+
+/// Makes the names in a folder last.
+fn sync(folder: &Path) -> anyhow::Result<()> {
+    // `.` stands for an empty path.
+    Ok(File::open(Path::new(".").join(folder))?.sync_all()?)
 }
 
 /// Removes what killed processes left in a folder, which nobody else may be writing to.

@@ -1,13 +1,15 @@
 //! The demonstration stream, from workers to the trainer, and what a recorder holds of it.
 
-use crate::message::{digest as checked_digest, name, position, required};
-use crate::recording::RecordedStep;
+use crate::image::render_spec;
+use crate::message::{action, digest as checked_digest, finite, name, position, required};
 use crate::sim::Variation;
 use crate::{Error, Image, Message, proto};
 use sha2::{Digest, Sha256};
 
 /// Most steps of an episode.
 pub const MAX_STEPS: u32 = 1000;
+/// Most values of a state.
+const MAX_STATE: usize = 1024;
 /// Most actions in a second of simulated time.
 const MAX_CONTROL_HZ: f64 = 10_000.0;
 
@@ -30,7 +32,7 @@ pub struct DemonstrationStep {
     pub success: bool,
 }
 
-/// A whole episode, without its steps: as its sender commits it, and as a recorder tells that it holds it.
+/// A whole episode, without its steps: as its sender commits it, and as its recording begins.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedEpisode {
     /// The episode.
@@ -45,6 +47,27 @@ pub struct RecordedEpisode {
     pub goal_position: Vec<f32>,
     /// Actions per second of simulated time.
     pub control_hz: f64,
+    /// Of every frame; see [`Image::render_spec`].
+    pub render_spec: String,
+}
+
+/// A step without its frame, as a recording has it beside; the fields are those of [`DemonstrationStep`].
+#[derive(Debug, Clone, PartialEq)]
+#[expect(missing_docs, reason = "see DemonstrationStep")]
+pub struct RecordedStep {
+    pub step: u32,
+    pub action: Option<Vec<f32>>,
+    pub state: Vec<f32>,
+    pub reward: f32,
+    pub success: bool,
+}
+
+impl RecordedStep {
+    /// The step as it was sent.
+    pub fn with_frame(self, episode_id: String, frame: Image) -> DemonstrationStep {
+        let Self { step, action, state, reward, success } = self;
+        DemonstrationStep { episode_id, step, frame, action, state, reward, success }
+    }
 }
 
 /// Closes an episode.
@@ -62,12 +85,13 @@ pub struct CommitEpisodeResponse {
 }
 
 /// SHA-256, in hex, over the steps in order, each as pixels, action, state and reward (little-endian 32-bit floats), and
-/// one byte that is 1 for success. A step without an action adds nothing for it.
+/// one byte that is 1 for success. A step without an action adds nothing for it. A reward of -0 counts as 0, since protobuf
+/// keeps no sign of a zero.
 pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> String {
     let mut hasher = Sha256::new();
     for DemonstrationStep { frame, action, state, reward, success, .. } in steps {
         hasher.update(frame.data());
-        for value in action.iter().flatten().chain(state).chain([reward]) {
+        for value in action.iter().flatten().chain(state).chain([&(reward + 0.0)]) {
             hasher.update(value.to_le_bytes());
         }
         hasher.update([u8::from(*success)]);
@@ -75,7 +99,7 @@ pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> Str
     hex::encode(hasher.finalize())
 }
 
-pub(crate) fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
+fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error> {
     if (min..=max).contains(&value) { Ok(value) } else { Err(Error::invalid(field, format!("{min} to {max}"), value)) }
 }
 
@@ -102,6 +126,37 @@ impl From<DemonstrationStep> for proto::DemonstrationStep {
     }
 }
 
+impl Message for RecordedStep {
+    type Proto = proto::RecordedStep;
+}
+
+impl TryFrom<proto::RecordedStep> for RecordedStep {
+    type Error = Error;
+
+    fn try_from(step: proto::RecordedStep) -> Result<Self, Error> {
+        if step.state.len() > MAX_STATE {
+            return Err(Error::invalid("state", format!("at most {MAX_STATE} values"), step.state.len()));
+        }
+        if !step.reward.is_finite() {
+            return Err(Error::invalid("reward", "a finite number", step.reward));
+        }
+        Ok(Self {
+            step: step_count("step", step.step, 0, MAX_STEPS - 1)?,
+            action: step.action.map(action).transpose().map_err(|e| e.within("action"))?,
+            state: finite("state", step.state)?,
+            reward: step.reward,
+            success: step.success,
+        })
+    }
+}
+
+impl From<RecordedStep> for proto::RecordedStep {
+    fn from(step: RecordedStep) -> Self {
+        let RecordedStep { step, action, state, reward, success } = step;
+        Self { step, action: action.map(|values| proto::Action { values }), state, reward, success }
+    }
+}
+
 impl Message for RecordedEpisode {
     type Proto = proto::RecordedEpisode;
 }
@@ -121,14 +176,15 @@ impl TryFrom<proto::RecordedEpisode> for RecordedEpisode {
             digest: checked_digest("digest", episode.digest)?,
             goal_position: position("goal_position", episode.goal_position)?,
             control_hz,
+            render_spec: render_spec("render_spec", episode.render_spec)?,
         })
     }
 }
 
 impl From<RecordedEpisode> for proto::RecordedEpisode {
     fn from(episode: RecordedEpisode) -> Self {
-        let RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz } = episode;
-        Self { episode_id, variation: Some(variation.into()), steps, digest, goal_position, control_hz }
+        let RecordedEpisode { episode_id, variation, steps, digest, goal_position, control_hz, render_spec } = episode;
+        Self { episode_id, variation: Some(variation.into()), steps, digest, goal_position, control_hz, render_spec }
     }
 }
 

@@ -68,6 +68,11 @@ pub fn episode_of_demonstration_step(key: &keyexpr) -> Option<String> {
     Some(format::demonstration_step::parse(key).ok()?.episode().to_string())
 }
 
+/// The episode, or `*`, in the key of its recording.
+pub fn episode_of_demonstration_recorded(key: &keyexpr) -> Option<String> {
+    Some(format::demonstration_recorded::parse(key).ok()?.episode().to_string())
+}
+
 /// The digest in the key of a checkpoint's pieces.
 pub fn digest_of_checkpoint_chunk(key: &keyexpr) -> Option<String> {
     Some(format::checkpoint_chunk::parse(key).ok()?.digest().to_string())

@@ -11,7 +11,6 @@ pub mod key;
 mod message;
 pub mod planner;
 pub mod query;
-pub mod recording;
 pub mod sim;
 
 pub use error::{Code, Error};

@@ -36,7 +36,7 @@ fn every_part_of_a_step_counts() {
         |step| step.frame = Image::new(84, 84, vec![0; 84 * 84 * 3]).unwrap(),
         |step| step.action.as_mut().unwrap()[2] += 0.5,
         |step| step.state[1] = 1.0,
-        |step| step.reward = -0.0,
+        |step| step.reward = 0.5,
         |step| step.success = true,
     ];
     for (number, spoil) in spoils.iter().enumerate() {
@@ -44,6 +44,15 @@ fn every_part_of_a_step_counts() {
         spoil(&mut steps[0]);
         assert_ne!(digest(&steps), whole, "part {number}");
     }
+}
+
+/// Protobuf keeps no sign of a zero, so the digest must not either.
+#[test]
+fn a_reward_of_minus_zero_is_zero() {
+    let [whole, mut negative] = [steps(), steps()];
+    negative[0].reward = -0.0;
+    assert_eq!(whole[0].reward, 0.0);
+    assert_eq!(digest(&negative), digest(&whole));
 }
 
 #[test]

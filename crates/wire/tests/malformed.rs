@@ -100,13 +100,15 @@ fn each_wrong_field_of_a_commit_is_named() {
         digest: "0".repeat(64),
         goal_position: Vec::new(),
         control_hz: 10.0,
+        render_spec: String::new(),
     };
     let decode = |episode| {
         decode::<CommitEpisodeRequest>(&proto::CommitEpisodeRequest { episode: Some(episode) }.encode_to_vec())
     };
     decode(good()).unwrap();
     type Spoil = fn(&mut proto::RecordedEpisode);
-    let cases: [(Spoil, &str, &str); 8] = [
+    let cases: [(Spoil, &str, &str); 9] = [
+        (|e| e.render_spec = "x".repeat(1025), "episode.render_spec", "1025 bytes"),
         (|e| e.steps = 1, "episode.steps", "1"),
         (|e| e.digest = "ABC".into(), "episode.digest", "\"ABC\""),
         (|e| e.goal_position = vec![0.0; 2], "episode.goal_position", "2"),

@@ -9,7 +9,6 @@ use std::time::Duration;
 use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
-use wire::recording::*;
 use wire::sim::*;
 use wire::{Image, Message, decode, encode};
 
@@ -37,14 +36,15 @@ fn position() -> impl Strategy<Value = Vec<f32>> {
 }
 
 fn recorded() -> impl Strategy<Value = RecordedEpisode> {
-    (name(), variation(), 2..=MAX_STEPS, digest(), position(), 0.1..100.0).prop_map(
-        |(episode_id, variation, steps, digest, goal_position, control_hz)| RecordedEpisode {
+    (name(), variation(), 2..=MAX_STEPS, digest(), position(), 0.1..100.0, "\\PC{0,30}").prop_map(
+        |(episode_id, variation, steps, digest, goal_position, control_hz, render_spec)| RecordedEpisode {
             episode_id,
             variation,
             steps,
             digest,
             goal_position,
             control_hz,
+            render_spec,
         },
     )
 }
@@ -142,7 +142,7 @@ proptest! {
     ) {
         let recorded = RecordedStep { step, action, state, reward, success };
         survives(recorded.clone());
-        survives(EpisodeHeader { episode: episode.clone(), render_spec: frame.render_spec().into() });
+
         survives(recorded.with_frame(episode.episode_id.clone(), frame));
         survives(episode.clone());
         survives(CommitEpisodeRequest { episode });
@@ -159,6 +159,6 @@ proptest! {
         let _ = decode::<ResetResponse>(&bytes);
         let _ = decode::<DemonstrationStep>(&bytes);
         let _ = decode::<CommitEpisodeRequest>(&bytes);
-        let _ = decode::<EpisodeHeader>(&bytes);
+        let _ = decode::<RecordedEpisode>(&bytes);
     }
 }

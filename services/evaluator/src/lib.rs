@@ -62,6 +62,7 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
         goal: args.goal,
     };
     let folder = Folder::new(&args.out);
+    folder.check_goal(args.goal)?;
     folder.write_run(&run)?;
     let link = trial::Link { session: session.clone(), planner: args.planner.clone(), timeout };
     schedule::Schedule::new(Arc::new(run), folder, link)?.drive(alive, patience).await?;

@@ -160,6 +160,17 @@ impl Folder {
         write_json(&self.path("run.json"), run)
     }
 
+    /// Checks that the folder is free for a run whose goals come from `goal`: trials lie in it by model and variation, so
+    /// that those of an ablation would take the place of the others.
+    pub(crate) fn check_goal(&self, goal: GoalSource) -> anyhow::Result<()> {
+        if self.path("run.json").exists() {
+            let got = self.read_run()?.goal;
+            let folder = self.root.display();
+            ensure!(got == goal, "--out: expected a folder for goals of {goal:?}, got {folder} with those of {got:?}");
+        }
+        Ok(())
+    }
+
     /// Reads what the run is.
     pub(crate) fn read_run(&self) -> anyhow::Result<Run> {
         let path = self.path("run.json");

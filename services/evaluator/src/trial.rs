@@ -47,6 +47,10 @@ impl From<Error> for Fault {
                 Self::NoGoalImage
             }
             Code::InvalidArgument => Self::Refused(error),
+            // Pictures of two renderings: they will not get alike by trying again.
+            Code::FailedPrecondition if error.field.ends_with("render_spec") || error.field == "goal_id" => {
+                Self::Refused(error)
+            }
             _ => Self::Broken(error),
         }
     }

@@ -9,9 +9,6 @@ use std::path::PathBuf;
 #[derive(Debug, Parser)]
 #[command(version)]
 pub struct Cli {
-    /// TOML file with the settings of the command.
-    #[arg(long, global = true)]
-    pub config: Option<PathBuf>,
     #[command(subcommand)]
     pub command: Command,
 }
@@ -33,6 +30,10 @@ pub enum Command {
 /// What was typed; what was not is left to the environment, the file and the defaults.
 #[derive(Debug, Args, Serialize)]
 pub struct ServeArgs {
+    /// TOML file with these settings.
+    #[arg(long)]
+    #[serde(skip)]
+    pub config: Option<PathBuf>,
     /// Where episodes are kept.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,6 +49,10 @@ pub struct ServeArgs {
 /// What was typed; what was not is left to the environment, the file and the defaults.
 #[derive(Debug, Args, Serialize)]
 pub struct TrainArgs {
+    /// TOML file with these settings.
+    #[arg(long)]
+    #[serde(skip)]
+    pub config: Option<PathBuf>,
     /// Folder of the demonstrations.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -118,6 +123,9 @@ pub struct VerifyArgs {
     /// Folder of the recordings.
     #[arg(long, default_value = "data/demonstrations")]
     pub dataset: PathBuf,
+    /// Tasks that there must be at least.
+    #[arg(long, default_value_t = 1)]
+    pub tasks: usize,
     /// Episodes that each task must have at least.
     #[arg(long, default_value_t = 1)]
     pub episodes: usize,

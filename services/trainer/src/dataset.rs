@@ -62,8 +62,8 @@ impl Dataset {
         let held_out: Vec<_> = held_out.iter().map(|task| folder.join(task)).collect();
         for path in recordings::paths(folder)? {
             if !held_out.iter().any(|task| path.starts_with(task)) {
-                let mut add = || dataset.push(&recording::read(&path)?);
-                add().with_context(|| path.display().to_string())?;
+                let episode = recordings::read(folder, &path)?;
+                dataset.push(&episode).with_context(|| path.display().to_string())?;
             }
         }
         ensure!(!dataset.episodes.is_empty(), "{}: expected demonstrations, got none", folder.display());
@@ -76,10 +76,10 @@ impl Dataset {
         if let Some(first) = self.episodes.first() {
             let (expected, got) = (first.actions.size()[1], episode.actions.size()[1]);
             ensure!(expected == got, "actions: expected {expected} values like the episodes before, got {got}");
-            let (expected, got) = (&self.render_spec, recording.render_spec());
+            let (expected, got) = (&self.render_spec, &recording.info().render_spec);
             ensure!(expected == got, "render_spec: expected {expected:?} like the episodes before, got {got:?}");
         }
-        self.render_spec = recording.render_spec().to_owned();
+        self.render_spec.clone_from(&recording.info().render_spec);
         let index = self.episodes.len();
         self.samples.extend((0..episode.action_count()).map(|step| Sample { episode: index, step }));
         self.episodes.push(episode);

@@ -86,9 +86,10 @@ impl Ingest {
     /// are under way; `INTERNAL` if the file cannot be written.
     pub fn commit(&self, request: &CommitEpisodeRequest) -> Result<Commit, Error> {
         let RecordedEpisode { episode_id, steps: count, .. } = &request.episode;
-        if let Some(kept) = self.recordings.get(episode_id) {
+        let lacking = self.recordings.lacks(&request.episode);
+        if !matches!(lacking, Ok(true)) {
             self.open().remove(episode_id);
-            return check_same(&kept, &request.episode).map(|()| Commit::KeptBefore);
+            return lacking.map(|_| Commit::KeptBefore);
         }
         let steps = {
             let mut open = self.open();
@@ -135,18 +136,4 @@ impl Ingest {
     fn open(&self) -> MutexGuard<'_, HashMap<String, Open>> {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// Checks that what is kept under an id is what is offered under it.
-pub(crate) fn check_same(kept: &RecordedEpisode, offered: &RecordedEpisode) -> Result<(), Error> {
-    let refused = |field, expected: &dyn ToString, got: &dyn ToString| {
-        Err(Error::new(Code::FailedPrecondition, field, expected.to_string(), got.to_string()))
-    };
-    if kept.digest != offered.digest {
-        return refused("digest", &kept.digest, &offered.digest);
-    }
-    if kept.variation != offered.variation {
-        return refused("variation", &format!("{:?}", kept.variation), &format!("{:?}", offered.variation));
-    }
-    Ok(())
 }

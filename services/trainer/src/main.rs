@@ -18,8 +18,10 @@ async fn main() -> anyhow::Result<()> {
     let cli = Cli::parse();
     telemetry::init();
     match cli.command {
-        Command::Serve(arguments) => serve(config::load("CPN_TRAINER_", cli.config.as_deref(), &arguments)?).await,
-        Command::Train(arguments) => train(config::load("CPN_TRAIN_", cli.config.as_deref(), &arguments)?).await,
+        Command::Serve(arguments) => {
+            serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await
+        }
+        Command::Train(arguments) => train(config::load("CPN_TRAIN_", arguments.config.as_deref(), &arguments)?).await,
         Command::Replay(arguments) => replay(arguments).await,
         Command::Mirror(arguments) => mirror(arguments).await,
         Command::Verify(arguments) => verify(&arguments),
@@ -73,8 +75,8 @@ async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Re
     session.close().await.map_err(|e| anyhow!(e))
 }
 
-fn verify(VerifyArgs { dataset, episodes, json }: &VerifyArgs) -> anyhow::Result<()> {
-    let report = verify::run(dataset, *episodes)?;
+fn verify(VerifyArgs { dataset, tasks, episodes, json }: &VerifyArgs) -> anyhow::Result<()> {
+    let report = verify::run(dataset, *tasks, *episodes)?;
     if *json {
         println!("{}", serde_json::to_string_pretty(&report)?);
     } else {

@@ -1,6 +1,5 @@
 //! A late joiner: fetches what other recorders keep, then follows them.
 
-use crate::ingest::check_same;
 use crate::recordings::Recordings;
 use crate::replay::{is_passing, patience};
 use backon::Retryable;
@@ -68,9 +67,9 @@ async fn pass(session: &Session, recordings: &Arc<Recordings>) -> Result<Pass, E
     let mut pass = Pass { offered: offered.len(), fetched: 0 };
     for episode in offered {
         let id = episode.episode_id.clone();
-        let result = match recordings.get(&id) {
-            Some(kept) => check_same(&kept, &episode),
-            None => fetch(session, recordings, episode).await.map(|()| pass.fetched += 1),
+        let result = match recordings.lacks(&episode) {
+            Ok(true) => fetch(session, recordings, episode).await.map(|()| pass.fetched += 1),
+            other => other.map(drop),
         };
         failed = result.map_err(|e| e.within(&id)).err().or(failed);
     }

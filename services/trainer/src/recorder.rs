@@ -92,9 +92,14 @@ fn commit(session: &Session, ingest: &Ingest, query: &Query) -> zenoh::Result<()
 
 /// Tells of every kept episode that is asked for.
 fn list(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
-    for episode in recordings.all() {
+    let asked = query.key_expr();
+    let episodes = match key::episode_of_demonstration_recorded(asked).filter(|episode| !episode.contains('*')) {
+        Some(episode_id) => recordings.get(&episode_id).into_iter().collect(),
+        None => recordings.all(),
+    };
+    for episode in episodes {
         let key = key::demonstration_recorded(&episode.episode_id)?;
-        if query.key_expr().intersects(&key) {
+        if asked.intersects(&key) {
             query::reply_at(query, &key, episode)?;
         }
     }

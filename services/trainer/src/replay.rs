@@ -30,10 +30,9 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
     };
     let mut sent = 0;
     for path in recordings::paths(folder)?.into_iter().filter(|path| wanted(path)) {
-        let reading = path.clone();
-        let episode = tokio::task::spawn_blocking(move || recording::read(&reading)).await?;
-        let name = || path.display().to_string();
-        send(session, &episode.with_context(name)?).await.with_context(name)?;
+        let (place, reading) = (folder.to_owned(), path.clone());
+        let episode = tokio::task::spawn_blocking(move || recordings::read(&place, &reading)).await??;
+        send(session, &episode).await.with_context(|| path.display().to_string())?;
         sent += 1;
     }
     info!(episodes = sent, "replayed");

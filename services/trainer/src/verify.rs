@@ -33,7 +33,7 @@ pub struct TaskReport {
     pub task: String,
     /// Kept episodes.
     pub episodes: usize,
-    /// Seeds below the largest kept one, from 0, of which no episode is kept: the expert failed.
+    /// Seeds between the smallest and the largest kept one of which no episode is kept: the expert failed.
     pub rejected: u64,
     /// Steps of an episode.
     pub steps_mean: f64,
@@ -44,19 +44,19 @@ pub struct TaskReport {
 /// One recording, read and reduced to what the report needs.
 struct Facts {
     info: RecordedEpisode,
-    render_spec: String,
     bytes: u64,
     constant_action: bool,
     faults: Vec<String>,
 }
 
-/// Reads every recording of `folder`, on every core, one at a time on each. Fewer than `episodes` of a task are a fault.
+/// Reads every recording of `folder`, on every core, one at a time on each. Fewer than `tasks` tasks, or fewer than
+/// `episodes` of one, are a fault.
 ///
 /// # Errors
 /// If the folder cannot be read; what is wrong inside it is in the report.
-pub fn run(folder: &Path, episodes: usize) -> anyhow::Result<Report> {
+pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Report> {
     let paths = recordings::paths(folder)?;
-    let read: Vec<_> = paths.par_iter().map(|path| facts(path)).collect();
+    let read: Vec<_> = paths.par_iter().map(|path| facts(folder, path)).collect();
     let mut by_task: BTreeMap<String, Vec<Facts>> =
         recordings::tasks(folder)?.into_iter().map(|task| (task, Vec::new())).collect();
     let mut faults = Vec::new();
@@ -67,8 +67,11 @@ pub fn run(folder: &Path, episodes: usize) -> anyhow::Result<Report> {
                 faults.extend(facts.faults.iter().map(|fault| format!("{place}: {fault}")));
                 by_task.entry(facts.info.variation.task.clone()).or_default().push(facts);
             }
-            Err(fault) => faults.push(format!("{fault:#}")),
+            Err(fault) => faults.push(format!("{fault:#} (remove the file and record it again)")),
         }
+    }
+    if by_task.len() < tasks {
+        faults.push(format!("expected at least {tasks} tasks, got {}", by_task.len()));
     }
     for (task, found) in &by_task {
         if found.len() < episodes {
@@ -79,7 +82,7 @@ pub fn run(folder: &Path, episodes: usize) -> anyhow::Result<Report> {
         }
     }
     let all = || by_task.values().flatten();
-    faults.extend(mixed("render_spec", all().map(|facts| facts.render_spec.clone())));
+    faults.extend(mixed("render_spec", all().map(|facts| facts.info.render_spec.clone())));
     faults.extend(mixed("control_hz", all().map(|facts| facts.info.control_hz.to_string())));
     if paths.is_empty() {
         faults.push(format!("{}: expected recordings, got none", folder.display()));
@@ -88,13 +91,12 @@ pub fn run(folder: &Path, episodes: usize) -> anyhow::Result<Report> {
     Ok(Report { tasks: by_task.iter().map(|(task, found)| summarise(task, found)).collect(), digest, faults })
 }
 
-fn facts(path: &Path) -> anyhow::Result<Facts> {
-    let read = || anyhow::Ok((recording::read(path)?, path.metadata()?.len()));
-    let (episode, bytes) = read().with_context(|| path.display().to_string())?;
+fn facts(folder: &Path, path: &Path) -> anyhow::Result<Facts> {
+    let episode = recordings::read(folder, path)?;
+    let bytes = path.metadata().with_context(|| path.display().to_string())?.len();
     let actions: Vec<_> = episode.steps().iter().filter_map(|step| step.action.as_ref()).collect();
     Ok(Facts {
         info: episode.info().clone(),
-        render_spec: episode.render_spec().to_owned(),
         bytes,
         constant_action: actions.windows(2).all(|pair| pair[0] == pair[1]),
         faults: faults(&episode),
@@ -136,11 +138,13 @@ fn mixed(field: &str, values: impl Iterator<Item = String>) -> Option<String> {
 
 fn summarise(task: &str, found: &[Facts]) -> TaskReport {
     let seeds: BTreeSet<u64> = found.iter().map(|facts| facts.info.variation.seed).collect();
-    let mean = |value: fn(&Facts) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
+    // The sum of nothing is -0.
+    let mean = |value: fn(&Facts) -> f64| (found.iter().map(value).sum::<f64>() + 0.0) / found.len().max(1) as f64;
+    let tries = seeds.last().zip(seeds.first()).map_or(0, |(largest, smallest)| (largest - smallest).saturating_add(1));
     TaskReport {
         task: task.to_owned(),
         episodes: found.len(),
-        rejected: seeds.last().map_or(0, |largest| largest - (seeds.len() as u64 - 1)),
+        rejected: tries - seeds.len() as u64,
         steps_mean: mean(|facts| facts.info.steps.into()),
         bytes_mean: mean(|facts| facts.bytes as f64),
     }
@@ -150,10 +154,11 @@ impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut table = Table::new();
         table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
-        table.set_header(["task", "episodes", "rejected", "steps (mean)", "bytes (mean)"]);
+        table.set_header(["task", "episodes", "rejected", "expert success", "steps (mean)", "bytes (mean)"]);
         for TaskReport { task, episodes, rejected, steps_mean, bytes_mean } in &self.tasks {
             let (steps, bytes) = (format!("{steps_mean:.1}"), format!("{bytes_mean:.0}"));
-            table.add_row([task.clone(), episodes.to_string(), rejected.to_string(), steps, bytes]);
+            let success = format!("{:.0} %", 100.0 * *episodes as f64 / (*episodes as f64 + *rejected as f64));
+            table.add_row([task.clone(), episodes.to_string(), rejected.to_string(), success, steps, bytes]);
         }
         for column in table.column_iter_mut().skip(1) {
             column.set_cell_alignment(CellAlignment::Right);

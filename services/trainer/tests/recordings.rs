@@ -83,7 +83,7 @@ async fn a_mirror_keeps_no_other_episode_under_the_same_id() {
 fn verify_tells_what_is_in_a_dataset() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
-    let report = verify::run(folder.path(), 1).unwrap();
+    let report = verify::run(folder.path(), 1, 1).unwrap();
     assert_eq!(report.faults, Vec::<String>::new());
     let rows: Vec<_> = report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.rejected, t.steps_mean)).collect();
     assert_eq!(rows, [("push", 1, 0, 4.0), ("reach", 2, 1, 4.0)]);
@@ -100,9 +100,10 @@ fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>))
     let mut info = info("reach", 3, &steps);
     plant(&mut info, &mut steps);
     info.digest = wire::demonstration::digest(&steps);
+    info.render_spec = steps[0].frame.render_spec().to_owned();
     let bytes = recording::to_bytes(&Episode::new(info, steps).unwrap()).unwrap();
     std::fs::write(folder.path().join("reach/reach-3.mcap"), bytes).unwrap();
-    verify::run(folder.path(), 1).unwrap().faults
+    verify::run(folder.path(), 1, 1).unwrap().faults
 }
 
 #[test]
@@ -132,6 +133,47 @@ fn verify_finds_what_is_wrong_inside_an_episode() {
     assert_eq!(found, [r#"control_hz: expected one, got 2: {"40", "80"}"#]);
 }
 
+/// By its place a recording is held out of a training, and found again by its id.
+#[test]
+fn a_recording_in_the_place_of_another_is_not_taken_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let wrong = folder.path().join("push/reach-2.mcap");
+    std::fs::rename(folder.path().join("reach/reach-2.mcap"), &wrong).unwrap();
+    let faults = verify::run(folder.path(), 1, 1).unwrap().faults;
+    assert!(matches!(&faults[..], [fault] if fault.contains("place: expected") && fault.contains("push/reach-2.mcap")));
+    let error = trainer::dataset::Dataset::load(folder.path(), &["reach".into()]).unwrap_err();
+    assert!(format!("{error:#}").contains("place: expected"), "{error:#}");
+    let recordings = Recordings::open(folder.path().to_owned()).unwrap();
+    assert_eq!(recordings.get("reach-2"), None, "passed over, so that it can be recorded again");
+    recordings.keep(&episode("reach", 2, 5)).unwrap();
+    assert_eq!(recordings.read("reach-2").unwrap(), Some(episode("reach", 2, 5)));
+}
+
+#[test]
+fn a_folder_has_one_keeper_and_an_id_one_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let recordings = Recordings::open(folder.path().to_owned()).unwrap();
+    let error = Recordings::open(folder.path().to_owned()).unwrap_err();
+    assert!(error.to_string().ends_with("expected a folder that no process keeps"), "{error}");
+
+    let kept = recordings.get("reach-0").unwrap();
+    assert_eq!(recordings.lacks(&kept), Ok(false));
+    let offers = [
+        ("digest", RecordedEpisode { digest: "0".repeat(64), ..kept.clone() }),
+        ("render_spec", RecordedEpisode { render_spec: "other".into(), ..kept.clone() }),
+        ("control_hz", RecordedEpisode { control_hz: 10.0, ..kept.clone() }),
+        ("render_spec", RecordedEpisode { render_spec: "other".into(), episode_id: "reach-9".into(), ..kept.clone() }),
+    ];
+    for (field, offered) in offers {
+        let error = recordings.lacks(&offered).unwrap_err();
+        assert_eq!((error.code, error.field.as_str()), (Code::FailedPrecondition, field));
+    }
+    recordings.keep(&episode("reach", 0, 4)).unwrap_err();
+    assert_eq!(recordings.read("reach-0").unwrap(), Some(episode("reach", 0, 3)), "left as it was");
+}
+
 #[test]
 fn verify_finds_what_is_wrong_with_the_whole() {
     let folder = tempfile::tempdir().unwrap();
@@ -141,7 +183,7 @@ fn verify_finds_what_is_wrong_with_the_whole() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     std::fs::write(&path, bytes).unwrap();
-    let faults = verify::run(folder.path(), 2).unwrap().faults;
+    let faults = verify::run(folder.path(), 1, 2).unwrap().faults;
     assert!(faults[0].contains("push-0.mcap: recording: Chunk CRC failed"), "{faults:?}");
     assert_eq!(faults[1..], ["push: expected at least 2 episodes, got 0"]);
 
@@ -149,8 +191,10 @@ fn verify_finds_what_is_wrong_with_the_whole() {
     still.iter_mut().filter_map(|step| step.action.as_mut()).for_each(|action| *action = vec![0.0; 4]);
     std::fs::remove_file(path).unwrap();
     keep(folder.path(), &Episode::new(info("stay", 0, &still), still).unwrap());
-    let faults = verify::run(folder.path(), 0).unwrap().faults;
+    let faults = verify::run(folder.path(), 1, 0).unwrap().faults;
     assert_eq!(faults, ["stay: expected actions that change, got constant ones in every episode"]);
+    let faults = verify::run(folder.path(), 9, 0).unwrap().faults;
+    assert_eq!(faults[0], "expected at least 9 tasks, got 3");
     let nothing = tempfile::tempdir().unwrap();
-    assert!(verify::run(nothing.path(), 0).unwrap().faults[0].ends_with("expected recordings, got none"));
+    assert!(verify::run(nothing.path(), 0, 0).unwrap().faults[0].ends_with("expected recordings, got none"));
 }
