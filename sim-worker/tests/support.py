@@ -4,7 +4,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import zenoh
+from numpy.typing import NDArray
+
+from cpn.v1 import types_pb2
 
 COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker"))
 READY_SECONDS = 60.0
@@ -26,3 +30,9 @@ def wait_for_sample(subscriber: "zenoh.Subscriber[queue.Queue[zenoh.Sample]]", k
     sample = subscriber.handler.get(timeout=READY_SECONDS)
     assert sample.kind == kind
     return sample
+
+
+def pixels(image: types_pb2.Image) -> NDArray[np.uint8]:
+    """An image's pixels, [height, width, 3]."""
+    assert image.format == types_pb2.PIXEL_FORMAT_RGB8
+    return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpn_sim_worker import meshes
-from cpn_sim_worker.meshes import decimated
+from cpn_sim_worker.meshes import Decimation, decimated
 
 
 def sphere(points: int) -> str:
@@ -36,7 +36,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_large_meshes_get_fewer_faces_on_the_same_surface() -> None:
     model = mujoco.MjModel.from_xml_string(SPHERES)
-    light = decimated(model, 500)
+    light = decimated(model, Decimation(500))
     large, small = model.mesh_facenum
     assert large > 5000
     assert 400 <= light.mesh_facenum[0] <= 500
@@ -50,18 +50,28 @@ def test_large_meshes_get_fewer_faces_on_the_same_surface() -> None:
 
 def test_the_original_stays_as_it_was() -> None:
     model, untouched = (mujoco.MjModel.from_xml_string(SPHERES) for _ in range(2))
-    decimated(model, 100)
+    decimated(model, Decimation(100))
     for name in ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal", "geom_pos", "body_inertia"):
         assert np.array_equal(getattr(model, name), getattr(untouched, name)), name
 
 
-def test_a_mesh_is_decimated_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        Decimation(400),
+        Decimation(500, min_aggressiveness=4),
+        Decimation(500, max_aggressiveness=11),
+        Decimation(500, neighbours=23),
+        Decimation(500, distance_weight=0.25),
+    ],
+)
+def test_a_mesh_is_decimated_once(cache: Path, monkeypatch: pytest.MonkeyPatch, change: Decimation) -> None:
     model = mujoco.MjModel.from_xml_string(SPHERES)
-    first = decimated(model, 500)
+    first = decimated(model, Decimation(500))
     assert len(list(cache.iterdir())) == 1
     monkeypatch.setattr(meshes.fast_simplification, "simplify", None)
-    again = decimated(model, 500)
+    again = decimated(model, Decimation(500))
     for name in ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal"):
         assert np.array_equal(getattr(first, name), getattr(again, name)), name
     with pytest.raises(TypeError):
-        decimated(model, 400)
+        decimated(model, change)

@@ -8,6 +8,7 @@ position, and nothing in the scene marks it.
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
 
+import hashlib
 import zlib
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpn_sim_worker.scene import Camera, Transition
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, SeedError
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, MissingExtraError, SeedError
+
+SCENE = Path(__file__).with_name("jenga_scene.xml")
 
 LEVELS = {"jenga-poke": (0,), "jenga-poke-offset": (1, 2)}
 """Levels a task pokes at, of the three whose blocks point at the arm, from below. They are 12 cm apart."""
@@ -50,8 +53,11 @@ START_ITERATIONS, STEP_ITERATIONS = 100, 5
 
 def _load_model() -> mujoco.MjModel:
     """The scene with the arm and hand that dm_control ships; its Python modules are not needed."""
-    kinova = files("dm_control") / "third_party" / "kinova"
-    scene = mujoco.MjSpec.from_file(str(Path(__file__).with_name("jenga_scene.xml")))
+    try:
+        kinova = files("dm_control") / "third_party" / "kinova"
+    except ModuleNotFoundError:
+        raise MissingExtraError("jenga", "dm_control") from None
+    scene = mujoco.MjSpec.from_file(str(SCENE))
     arm = mujoco.MjSpec.from_file(str(kinova / "jaco_arm.xml"))
     hand = mujoco.MjSpec.from_file(str(kinova / "jaco_hand.xml"))
     # Where the tips of the closed fingers meet.
@@ -78,6 +84,7 @@ class JengaScene:
     """At 1 cm a step this is 10 cm/s, half of what the real arm can do; its servos are a quarter of a step behind."""
     camera = Camera("view", flip="rows")
     libraries = ("dm_control",)
+    revision = hashlib.sha256(SCENE.read_bytes()).hexdigest()[:16]
 
     goal_position: NDArray[np.float64]
     """[3], where the fingertip is when it has just poked the target block: the centre of its face, pushed in."""

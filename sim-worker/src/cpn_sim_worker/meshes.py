@@ -8,10 +8,10 @@ A software renderer spends its time on vertices, and Sawyer's arm has more faces
 
 import copy
 import hashlib
+import json
 import os
 import tempfile
-from dataclasses import dataclass
-from importlib.metadata import version
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import fast_simplification
@@ -21,11 +21,28 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 from scipy.spatial import KDTree
 
-AGGRESSIVENESS = range(3, 11)
-"""Of the quadric decimation, in the order of trying: less spends the faces better, more comes down to fewer."""
+from cpn_sim_worker.render_spec import installed_version
 
-NEIGHBOURS = 24
-"""Original corners that a new corner takes its normal from: the nearest ones."""
+LIBRARIES = ("fast-simplification", "numpy", "scipy")
+"""Names of the packages that decide what a mesh is decimated to."""
+
+
+@dataclass(frozen=True)
+class Decimation:
+    """How meshes are decimated."""
+
+    max_faces: int = 1000
+    """Faces that a mesh may have. `make bench-sim` holds the mean SSIM of every task's pictures to the undecimated ones
+    to 0.97."""
+    min_aggressiveness: int = 3
+    """Of the quadric decimation, tried first: less spends the faces better, more comes down to fewer."""
+    max_aggressiveness: int = 10
+    """Tried last."""
+    neighbours: int = 24
+    """Original corners that a new corner takes its normal from: the nearest ones."""
+    distance_weight: float = 0.5
+    """What an original corner loses by being an edge away, where one whose normal is at right angles to the new face's
+    loses 1."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +57,8 @@ class _Mesh:
     """[F, 3], the corner of the original mesh, 0 to 3 F', whose normal and texture each corner takes."""
 
 
-def decimated(model: mujoco.MjModel, max_faces: int) -> mujoco.MjModel:
-    """A copy of a model to be rendered, in which no mesh has more than `max_faces` faces.
+def decimated(model: mujoco.MjModel, decimation: Decimation) -> mujoco.MjModel:
+    """A copy of a model to be rendered, in which no mesh has more than `decimation.max_faces` faces.
 
     Positions, sizes and counts of all bodies and geoms stay as they are, so that the data of the original model shows
     the copy as well. The copy is for rendering only: the physics keeps the original.
@@ -49,7 +66,7 @@ def decimated(model: mujoco.MjModel, max_faces: int) -> mujoco.MjModel:
     light = copy.copy(model)
     for mesh in range(model.nmesh):
         count, first = int(model.mesh_facenum[mesh]), int(model.mesh_faceadr[mesh])
-        if count <= max_faces:
+        if count <= decimation.max_faces:
             continue
         faces = slice(first, first + count)
         vertices = _range(model.mesh_vertadr[mesh], model.mesh_vertnum[mesh])
@@ -58,7 +75,7 @@ def decimated(model: mujoco.MjModel, max_faces: int) -> mujoco.MjModel:
             model.mesh_vert[vertices],
             model.mesh_face[faces],
             model.mesh_normal[normals][model.mesh_facenormal[faces]],
-            max_faces,
+            decimation,
         )
         kept = slice(first, first + len(simple.faces))
         light.mesh_vert[vertices][: len(simple.vertices)] = simple.vertices
@@ -74,18 +91,20 @@ def _range(first: int, count: int) -> slice:
 
 
 def _decimate(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], max_faces: int
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], decimation: Decimation
 ) -> _Mesh:
     """Decimates a mesh of vertices [V, 3], faces [F, 3] and corner normals [F, 3, 3], or finds it in the cache."""
-    digest = hashlib.sha256(f"1 {version('fast-simplification')} {max_faces} {AGGRESSIVENESS} {NEIGHBOURS}".encode())
+    versions = {package: installed_version(package) for package in LIBRARIES}
+    digest = hashlib.sha256(json.dumps([asdict(decimation), versions]).encode())
     for array in (vertices, faces, normals):
         digest.update(array.tobytes())
     path = user_cache_path("cpn") / "meshes" / f"{digest.hexdigest()}.npz"
     if path.exists():
         with np.load(path, allow_pickle=False) as archive:
             return _Mesh(archive["vertices"], archive["faces"], archive["corners"])
-    new_vertices, new_faces = _simplify(*_merge_equal_vertices(vertices, faces), max_faces)
-    mesh = _Mesh(new_vertices, new_faces, _nearest_corners(new_vertices, new_faces, vertices, faces, normals))
+    new_vertices, new_faces = _simplify(*_merge_equal_vertices(vertices, faces), decimation)
+    corners = _nearest_corners(new_vertices, new_faces, vertices, faces, normals, decimation)
+    mesh = _Mesh(new_vertices, new_faces, corners)
     _save(path, mesh)
     return mesh
 
@@ -101,9 +120,10 @@ def _merge_equal_vertices(
 
 
 def _simplify(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], decimation: Decimation
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    for aggressiveness in AGGRESSIVENESS:
+    max_faces = decimation.max_faces
+    for aggressiveness in range(decimation.min_aggressiveness, decimation.max_aggressiveness + 1):
         simple, left, *_ = fast_simplification.simplify(vertices, faces, target_count=max_faces, agg=aggressiveness)
         simple, left = simple.astype(np.float32), left.astype(np.int32)
         left = left[_areas_and_normals(simple, left)[0] > 0]
@@ -128,17 +148,19 @@ def _nearest_corners(
     vertices: NDArray[np.float32],
     faces: NDArray[np.int32],
     normals: NDArray[np.float32],
+    decimation: Decimation,
 ) -> NDArray[np.int32]:
     """For each new corner, [F, 3], the original corner nearby whose normal fits the new face best.
 
     So round parts stay smooth and edges stay sharp: flat facets, not missing detail, are what would catch the eye.
     """
-    distances, candidates = map(np.asarray, KDTree(vertices[faces].reshape(-1, 3)).query(new_vertices, k=NEIGHBOURS))
+    tree = KDTree(vertices[faces].reshape(-1, 3))
+    distances, candidates = map(np.asarray, tree.query(new_vertices, k=decimation.neighbours))
     twice_areas, face_normals = _areas_and_normals(new_vertices, new_faces)
     edge = np.sqrt(np.median(twice_areas))
     distances, candidates = distances[new_faces], candidates[new_faces]  # [F, 3, K]
     alignment = np.einsum("fckx,fx->fck", normals.reshape(-1, 3)[candidates], face_normals)
-    best = np.argmax(alignment - 0.5 * distances / edge, axis=-1, keepdims=True)
+    best = np.argmax(alignment - decimation.distance_weight * distances / edge, axis=-1, keepdims=True)
     return np.take_along_axis(candidates, best, axis=-1)[..., 0].astype(np.int32)
 
 

@@ -25,6 +25,7 @@ class MetaWorldScene:
     # The close pose, in which 84 pixels still resolve a handle. Meta-World hangs it upside down.
     camera = Camera("corner4", flip="columns")
     libraries = ("metaworld",)
+    revision = ""
     action_size = 4
     """Hand displacement x, y, z and gripper effort, each in [-1, 1]; a displacement of 1 is 1 cm."""
 

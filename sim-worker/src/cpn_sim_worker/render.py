@@ -4,8 +4,7 @@
 # pyright: reportAttributeAccessIssue=false
 
 import copy
-from functools import cache
-from importlib.metadata import version
+from dataclasses import asdict
 from typing import ClassVar
 
 import mujoco
@@ -13,24 +12,17 @@ import numpy as np
 from mujoco.gl_context import GLContext
 from numpy.typing import NDArray
 
-from cpn_sim_worker.meshes import decimated
-from cpn_sim_worker.render_spec import RenderSpec
+from cpn_sim_worker.meshes import LIBRARIES, Decimation, decimated
+from cpn_sim_worker.render_spec import RenderSpec, installed_version
 from cpn_sim_worker.scene import Scene
 from cpn_sim_worker.spaces import IMAGE_SIZE
 
 MAX_GEOMS = 1000
 
-MAX_MESH_FACES = 1000
-"""At which no task's picture is less than 0.97 alike (SSIM) to the undecimated one; `make bench-sim` measures it."""
+DECIMATION = Decimation()
 
 TESSELLATION = (2, 16, 8)
-"""Half of MuJoCo's own quads, slices and stacks: no more than rounding at this size."""
-
-
-@cache
-def _version(package: str) -> str:
-    """The installed version; looking it up takes as long as a frame."""
-    return version(package)
+"""About half of MuJoCo's own quads, slices and stacks, wherever meshes are decimated."""
 
 
 class Renderer:
@@ -40,15 +32,16 @@ class Renderer:
     an error. So here one GL context lives as long as the process, and a new model replaces the resources of the one
     before in that same context.
 
-    What is drawn is a lighter copy of the scene's model; the physics never sees it.
+    What is drawn is a copy of the scene's model, which the physics never sees: a lighter one, unless `decimation` is
+    None.
     """
 
     _exists: ClassVar[bool] = False
 
-    def __init__(self, max_mesh_faces: int | None = MAX_MESH_FACES) -> None:
+    def __init__(self, decimation: Decimation | None = DECIMATION) -> None:
         if Renderer._exists:
             raise RuntimeError("a process can hold one Renderer only: a second one would return garbage frames")
-        self._max_mesh_faces = max_mesh_faces
+        self._decimation = decimation
         self._gl = GLContext(IMAGE_SIZE, IMAGE_SIZE)
         Renderer._exists = True
         self._gl.make_current()
@@ -63,7 +56,7 @@ class Renderer:
 
     def spec(self, scene: Scene) -> RenderSpec:
         """How `render` draws a scene."""
-        packages = ("mujoco", *scene.libraries) + (("fast-simplification",) if self._max_mesh_faces else ())
+        packages = ("mujoco", *scene.libraries, *(LIBRARIES if self._decimation else ()))
         return RenderSpec(
             camera=scene.camera.name,
             flip=scene.camera.flip,
@@ -73,20 +66,24 @@ class Renderer:
             shadows=False,
             reflections=False,
             multisamples=0,
-            max_mesh_faces=self._max_mesh_faces,
-            tessellation=TESSELLATION,
-            versions={package: _version(package) for package in packages},
+            decimation=asdict(self._decimation) if self._decimation else None,
+            tessellation=self._tessellation(scene),
+            revision=scene.revision,
+            versions={package: installed_version(package) for package in packages},
         )
+
+    def _tessellation(self, scene: Scene) -> tuple[int, int, int]:
+        quality = scene.model.vis.quality
+        return TESSELLATION if self._decimation else (quality.numquads, quality.numslices, quality.numstacks)
 
     def _load(self, scene: Scene) -> mujoco.MjrContext:
         if self._context is not None:
             self._context.free()
-        faces = self._max_mesh_faces
-        model = copy.copy(scene.model) if faces is None else decimated(scene.model, faces)
-        # Shadows, reflections and multisampling are nine tenths of the time in a software renderer.
+        model = decimated(scene.model, self._decimation) if self._decimation else copy.copy(scene.model)
+        # Shadows, reflections and multisampling would take most of a software renderer's time.
         quality = model.vis.quality
         quality.offsamples = quality.shadowsize = 0
-        quality.numquads, quality.numslices, quality.numstacks = TESSELLATION
+        quality.numquads, quality.numslices, quality.numstacks = self._tessellation(scene)
         model.vis.global_.offwidth = model.vis.global_.offheight = IMAGE_SIZE
         self._drawing = mujoco.MjvScene(model, MAX_GEOMS)
         self._drawing.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False

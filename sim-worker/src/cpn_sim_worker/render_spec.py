@@ -6,6 +6,8 @@ carries the spec of its rendering, recordings and checkpoints keep it, and whoev
 
 import json
 from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import version
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,21 @@ class RenderSpec:
     shadows: bool
     reflections: bool
     multisamples: int
-    max_mesh_faces: int | None
-    """Faces that a mesh is decimated to; none if meshes are drawn as they are."""
+    decimation: dict[str, float] | None
+    """The settings of `meshes.Decimation`; None if meshes are drawn as they are."""
     tessellation: tuple[int, int, int]
     """Quads along the side of a box or plane; slices and stacks of a sphere or cylinder."""
+    revision: str
+    """Of the scene, where no package's version tells it."""
     versions: dict[str, str]
     """Of every package that the pixels depend on."""
 
     def __str__(self) -> str:
         """The spec as JSON, the same text for the same spec."""
         return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
+
+
+@cache
+def installed_version(package: str) -> str:
+    """The version of a package; looking it up takes as long as a frame."""
+    return version(package)

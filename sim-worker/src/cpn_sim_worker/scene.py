@@ -44,6 +44,11 @@ class Scene(Protocol):
         ...
 
     @property
+    def revision(self) -> str:
+        """Tells apart the scene's own states of development; empty if the version of a library does."""
+        ...
+
+    @property
     def action_size(self) -> int:
         """A."""
         ...

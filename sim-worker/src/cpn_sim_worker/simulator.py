@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from cpn_sim_worker.jenga import JengaScene
 from cpn_sim_worker.metaworld_scene import MetaWorldScene
 from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.render_spec import RenderSpec
@@ -14,29 +15,36 @@ def _load(task: str) -> Scene:
     check_task(task)
     if task in TASKS:
         return MetaWorldScene(task)
-    # The arm's model comes with an extra that Meta-World's users do without.
-    from cpn_sim_worker.jenga import JengaScene
-
     return JengaScene(task)
 
 
 class Simulator:
-    """One scene at a time, loaded when its task is first reset."""
+    """One scene at a time."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
         self._task: str | None = None
+
+    def load(self, task: str) -> None:
+        """Hosts the scene of `task`, unless it does already.
+
+        Raises:
+            UnknownTaskError: If there is no such task.
+            MissingExtraError: If it needs an extra that is not installed.
+        """
+        if task != self._task:
+            self.scene = _load(task)
+            self._task = task
 
     def reset(self, task: str, seed: int) -> NDArray[np.float64]:
         """Starts the variation of `task` that `seed` draws; returns the state, [S].
 
         Raises:
             UnknownTaskError: If there is no such task.
+            MissingExtraError: If it needs an extra that is not installed.
             SeedError: If it has no such variation.
         """
-        if task != self._task:
-            self.scene = _load(task)
-            self._task = task
+        self.load(task)
         return self.scene.reset(seed)
 
     def step(self, action: NDArray[np.float32]) -> Transition:

@@ -44,6 +44,15 @@ class SeedError(ValueError):
         self.got = got
 
 
+class MissingExtraError(Exception):
+    """A package is not installed that a task needs and an extra of this one brings."""
+
+    def __init__(self, extra: str, package: str) -> None:
+        self.expected = f"cpn-sim-worker to be installed with its extra {extra}"
+        self.got = f"no package {package}"
+        super().__init__(f"expected {self.expected}, got {self.got}")
+
+
 class UnknownTaskError(ValueError):
     """A task that is none of ours."""
 
