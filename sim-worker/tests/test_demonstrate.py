@@ -15,8 +15,8 @@ from cpn_sim_worker.scene import Transition
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.stream import digest
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
-from cpn_sim_worker.wire import action_from_proto, decode, encoding, image_from_proto
-from tests.support import COMMAND, UNSOLVED
+from cpn_sim_worker.wire import action_from_proto, decode, encoding
+from tests.support import COMMAND, UNSOLVED, pixels
 
 Step = demonstration_pb2.DemonstrationStep
 ROOT = Path(__file__).resolve().parents[2]
@@ -97,9 +97,10 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
     steps = [trainer.steps["reach-5"][number] for number in range(episode.steps)]
     assert episode.digest == digest(steps)
     arrival = Transition(simulator.reset("reach", 5), reward=0, success=False)
+    assert episode.render_spec == str(simulator.render_spec)
     for number, step in enumerate(steps):
-        assert np.array_equal(image_from_proto(step.frame, "frame"), simulator.frame())
-        assert step.frame.render_spec == str(simulator.render_spec)
+        assert np.array_equal(pixels(step.frame), simulator.frame())
+        assert step.frame.render_spec == episode.render_spec
         assert np.array_equal(step.state, arrival.state.astype(np.float32))
         assert (step.reward, step.success) == (np.float32(arrival.reward), arrival.success)
         assert step.HasField("action") == (number < episode.steps - 1)
@@ -125,6 +126,20 @@ def test_digest_is_the_same_in_every_language() -> None:
         for n in range(3)
     ]
     assert digest(steps) == golden["digest"]
+
+
+def test_digest_does_not_tell_a_reward_of_minus_zero_from_zero() -> None:
+    zero, minus_zero = Step(reward=0.0), Step(reward=-0.0)
+    assert zero.SerializeToString() != minus_zero.SerializeToString()
+    assert digest([zero]) == digest([minus_zero]) != digest([Step(reward=0.5)])
+
+
+def test_another_rendering_is_not_taken_for_recorded(trainer: Trainer, endpoint: str) -> None:
+    trainer.kept["reach-0"] = demonstration_pb2.RecordedEpisode(episode_id="reach-0", render_spec="another")
+    run = demonstrate(endpoint, "--tasks", "reach", "--episodes", "1")
+    assert run.returncode == 1
+    assert 'FAILED_PRECONDITION render_spec: expected another, got {"camera":"corner4",' in run.stderr
+    assert trainer.received == []
 
 
 def test_failed_expert_runs_are_rejected_and_counted(trainer: Trainer, endpoint: str) -> None:

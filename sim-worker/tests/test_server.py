@@ -1,5 +1,6 @@
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 
@@ -14,8 +15,8 @@ from cpn_sim_worker.server import QUEUE_LENGTH, ServeConfig, SimServer
 from cpn_sim_worker.session import UnavailableError, ask
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
-from cpn_sim_worker.wire import MAX_PAYLOAD_BYTES, RequestError, decode, encoding, image_from_proto
-from tests.support import READY_SECONDS, UNSOLVED, StartWorker, collect, wait_for_sample
+from cpn_sim_worker.wire import MAX_PAYLOAD_BYTES, RequestError, decode, encoding
+from tests.support import READY_SECONDS, UNSOLVED, StartWorker, collect, pixels, wait_for_sample
 
 SEED = FIRST_EVALUATION_SEED + 1
 REST = (0.0, 0.0, 0.0, 0.0)
@@ -53,12 +54,12 @@ def worker(session: zenoh.Session, start_worker: StartWorker) -> Worker:
 def test_episode_runs_to_its_last_step(worker: Worker) -> None:
     start = worker.reset()
     assert start.max_steps == 6
-    first = image_from_proto(start.observation, "observation")
-    assert not np.array_equal(first, image_from_proto(start.goal, "goal"))
+    first = pixels(start.observation)
+    assert not np.array_equal(first, pixels(start.goal))
     responses = [worker.step(start.episode_id, step, (0, 0, 1, 0)) for step in range(6)]
     assert [response.done for response in responses] == [False] * 5 + [True]
     assert not any(response.success for response in responses)
-    assert not np.array_equal(first, image_from_proto(responses[-1].observation, "observation"))
+    assert not np.array_equal(first, pixels(responses[-1].observation))
     with pytest.raises(RequestError, match=r"FAILED_PRECONDITION episode_id: .*one that ended after 6 steps"):
         worker.step(start.episode_id, 6)
 
@@ -79,8 +80,10 @@ def test_goal_of_another_variation(worker: Worker) -> None:
     assert (mixed.observation, mixed.goal) == (here.observation, there.goal)
     assert here.goal != there.goal
     task, unsolved = UNSOLVED
-    with pytest.raises(RequestError, match=r"FAILED_PRECONDITION goal_seed"):
+    with pytest.raises(RequestError, match=f"FAILED_PRECONDITION goal_seed: .*, got {unsolved}$"):
         worker.reset(task, unsolved + 1, goal_seed=unsolved)
+    with pytest.raises(RequestError, match=rf"FAILED_PRECONDITION variation\.seed: .*, got {unsolved}$"):
+        worker.reset(task, unsolved, goal_seed=unsolved + 1)
 
 
 def test_jenga_is_served_by_the_same_worker(worker: Worker) -> None:
@@ -95,6 +98,14 @@ def test_jenga_is_served_by_the_same_worker(worker: Worker) -> None:
     with pytest.raises(RequestError, match=r"INVALID_ARGUMENT variation.seed: expected at least 1000000, got 3"):
         worker.reset("jenga-poke-offset", 3)
     worker.reset()
+
+
+def test_task_without_its_extra_is_refused(simulator: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dm_control", None)
+    runner = EpisodeRunner(Simulator(simulator._renderer), max_steps=1)
+    request = sim_pb2.ResetRequest(variation=types_pb2.Variation(task="jenga-poke", seed=SEED))
+    with pytest.raises(RequestError, match=r"FAILED_PRECONDITION variation\.task: expected .* extra jenga, got"):
+        runner.reset(request)
 
 
 def test_step_is_applied_exactly_once(worker: Worker) -> None:
@@ -186,11 +197,11 @@ def test_two_workers_never_mix_their_frames(
         start_worker(name)
     workers = {name: Worker(session, name) for name in tasks}
     starts = {name: workers[name].reset(task) for name, task in tasks.items()}
-    got = {name: [image_from_proto(start.observation, "observation")] for name, start in starts.items()}
+    got = {name: [pixels(start.observation)] for name, start in starts.items()}
     for step in range(4):
         for name, worker in workers.items():
             response = worker.step(starts[name].episode_id, step, (1, 0, -1, 1))
-            got[name].append(image_from_proto(response.observation, "observation"))
+            got[name].append(pixels(response.observation))
     for name, task in tasks.items():
         simulator.reset(task, SEED)
         for frame in got[name]:

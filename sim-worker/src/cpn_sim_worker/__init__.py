@@ -1,4 +1,4 @@
-"""Meta-World tasks as zenoh services, and expert demonstrations streamed from them."""
+"""Meta-World tasks and a Jenga tower as zenoh services, and expert demonstrations streamed from them."""
 
 import os
 

@@ -18,7 +18,7 @@ from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.session import UnavailableError, ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.stream import EpisodeLostError, digest, is_recorded, send_episode
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, SeedError, check_task
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, MissingExtraError, SeedError, check_task
 from cpn_sim_worker.wire import RequestError, action_to_proto, image_to_proto
 
 
@@ -63,17 +63,19 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
     Raises:
         ExpertFailedError: If the expert does not solve the variation.
         EpisodeLostError: If steps stay missing.
-        RequestError: If the trainer refuses the episode.
+        RequestError: If the trainer refuses the episode, or holds it in another rendering.
         UnavailableError: If the trainer stays away.
     """
     episode_id = f"{task}-{seed}"
-    if is_recorded(session, episode_id):
+    simulator.load(task)
+    render_spec = str(simulator.render_spec)
+    if is_recorded(session, episode_id, render_spec):
         return
     steps = [
         demonstration_pb2.DemonstrationStep(
             episode_id=episode_id,
             step=number,
-            frame=image_to_proto(simulator.frame(), simulator.render_spec),
+            frame=image_to_proto(simulator.frame(), render_spec),
             action=None if moment.action is None else action_to_proto(moment.action),
             state=moment.arrival.state,
             reward=moment.arrival.reward,
@@ -88,6 +90,7 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
         digest=digest(steps),
         goal_position=simulator.scene.goal_position,
         control_hz=simulator.scene.control_hz,
+        render_spec=render_spec,
     )
     send_episode(session, steps, episode)
 
@@ -113,7 +116,7 @@ def _run_tasks(
                     except ExpertFailedError:
                         tries.put(Try(task, kept=False))
                     seed += 1
-    except (UnavailableError, RequestError, EpisodeLostError, SeedError) as error:
+    except (UnavailableError, RequestError, EpisodeLostError, MissingExtraError, SeedError) as error:
         sys.exit(f"demonstrations stopped: {error}")
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.simulator import Simulator
-from cpn_sim_worker.tasks import SeedError, UnknownTaskError, check_task
+from cpn_sim_worker.tasks import MissingExtraError, SeedError, UnknownTaskError
 from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto, invalid
 
 
@@ -42,25 +42,17 @@ class EpisodeRunner:
         """Ends the running episode and starts one of the requested variation."""
         task, seed = request.variation.task, request.variation.seed
         try:
-            check_task(task)
+            self._simulator.load(task)
         except UnknownTaskError as error:
             raise invalid("variation.task", error.expected, repr(task)) from None
-        field, goal_seed = (
-            ("goal_seed", request.goal_seed) if request.HasField("goal_seed") else ("variation.seed", seed)
-        )
+        except MissingExtraError as error:
+            code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
+            raise RequestError(code, "variation.task", error.expected, error.got) from None
         self.abandon()
-        try:
-            for _ in solve(self._simulator, task, goal_seed):
-                pass
-        except SeedError as error:
-            raise invalid(field, error.expected, error.got) from None
-        except ExpertFailedError as error:
-            raise RequestError(
-                types_pb2.ERROR_CODE_FAILED_PRECONDITION,
-                field,
-                "a seed whose variation the scripted expert solves, for the goal image",
-                error.seed,
-            ) from None
+        # Even where the goal is another's: so the same variations can be asked for with either goal.
+        self._solve(task, seed, "variation.seed")
+        if request.HasField("goal_seed"):
+            self._solve(task, request.goal_seed, "goal_seed")
         goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
         self._simulator.reset(task, seed)
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
@@ -108,5 +100,17 @@ class EpisodeRunner:
         """Ends the running episode, if any: further steps of it are refused."""
         self._episode = None
 
+    def _solve(self, task: str, seed: int, field: str) -> None:
+        """Leaves the simulator at the end of the expert's run; `field` names the seed in a `RequestError`."""
+        try:
+            for _ in solve(self._simulator, task, seed):
+                pass
+        except SeedError as error:
+            raise invalid(field, error.expected, error.got) from None
+        except ExpertFailedError as error:
+            code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
+            expected = "a seed whose variation the scripted expert solves"
+            raise RequestError(code, field, expected, error.seed) from None
+
     def _frame(self) -> types_pb2.Image:
-        return image_to_proto(self._simulator.frame(), self._simulator.render_spec)
+        return image_to_proto(self._simulator.frame(), str(self._simulator.render_spec))

@@ -33,7 +33,7 @@ POLL_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """Serve Meta-World tasks over zenoh until SIGTERM or SIGINT."""
+    """Serve Meta-World's and Jenga's tasks over zenoh until SIGTERM or SIGINT."""
 
     worker: str = "w0"
     """Name of this worker in its keys."""
@@ -44,6 +44,7 @@ class ServeConfig:
     def __post_init__(self) -> None:
         if not self.worker or any(character in "/*$?#" for character in self.worker):
             raise ValueError(f"worker: expected a name without any of / * $ ? #, got {self.worker!r}")
+        # Meta-World's environments refuse to go on after that many; Jenga would.
         if not 1 <= self.max_steps <= SawyerXYZEnv.max_path_length:
             raise ValueError(f"max_steps: expected 1 to {SawyerXYZEnv.max_path_length}, got {self.max_steps}")
 

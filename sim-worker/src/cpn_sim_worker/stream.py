@@ -10,7 +10,7 @@ from tenacity import retry, retry_if_exception, stop_after_delay, wait_exponenti
 from cpn.v1 import demonstration_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.session import UnavailableError, ask
-from cpn_sim_worker.wire import RequestError, encoding
+from cpn_sim_worker.wire import RequestError, decode, encoding
 
 COMMIT_TIMEOUT_SECONDS = 5.0
 TRAINER_PATIENCE_SECONDS = 120.0
@@ -29,16 +29,30 @@ def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
     hasher = hashlib.sha256()
     for step in steps:
         hasher.update(step.frame.data)
-        for values in (step.action.values, step.state, [step.reward]):
+        # Not every encoder sends a reward of -0, so a receiver may see 0.
+        for values in (step.action.values, step.state, [step.reward + 0.0]):
             hasher.update(np.array(values, "<f4").tobytes())
         hasher.update(bytes([step.success]))
     return hasher.hexdigest()
 
 
-def is_recorded(session: zenoh.Session, episode_id: str) -> bool:
-    """Whether a recorder that is up holds the episode."""
+def is_recorded(session: zenoh.Session, episode_id: str, render_spec: str) -> bool:
+    """Whether a recorder that is up holds the episode.
+
+    Raises:
+        RequestError: If it holds the episode in another rendering.
+    """
     replies = session.get(keys.demonstration_recorded(episode_id), timeout=LOOKUP_TIMEOUT_SECONDS)
-    return any(reply.ok is not None for reply in replies)
+    recorded = [
+        decode(demonstration_pb2.RecordedEpisode, reply.ok.payload.to_bytes())
+        for reply in replies
+        if reply.ok is not None
+    ]
+    for episode in recorded:
+        if episode.render_spec != render_spec:
+            code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
+            raise RequestError(code, "render_spec", episode.render_spec, render_spec)
+    return bool(recorded)
 
 
 def send_episode(

@@ -7,13 +7,9 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from cpn.v1 import types_pb2
-from cpn_sim_worker.render_spec import RenderSpec
-from cpn_sim_worker.spaces import IMAGE_SIZE
 
 MAX_PAYLOAD_BYTES = 1 << 20
 """Far above every message of the project but a whole checkpoint, which no worker receives."""
-
-IMAGE_BYTES = IMAGE_SIZE * IMAGE_SIZE * 3
 
 M = TypeVar("M", bound=Message)
 
@@ -65,7 +61,7 @@ def decode(message_type: type[M], payload: bytes) -> M:
     return message
 
 
-def image_to_proto(pixels: NDArray[np.uint8], spec: RenderSpec) -> types_pb2.Image:
+def image_to_proto(pixels: NDArray[np.uint8], render_spec: str) -> types_pb2.Image:
     """An image, [84, 84, 3], and how it was rendered, as a message."""
     height, width, _ = pixels.shape
     return types_pb2.Image(
@@ -73,20 +69,8 @@ def image_to_proto(pixels: NDArray[np.uint8], spec: RenderSpec) -> types_pb2.Ima
         width=width,
         format=types_pb2.PIXEL_FORMAT_RGB8,
         data=pixels.tobytes(),
-        render_spec=str(spec),
+        render_spec=render_spec,
     )
-
-
-def image_from_proto(image: types_pb2.Image, field: str) -> NDArray[np.uint8]:
-    """An image, [84, 84, 3], from its message; `field` names it in a `RequestError`."""
-    if image.format != types_pb2.PIXEL_FORMAT_RGB8:
-        raise invalid(f"{field}.format", "PIXEL_FORMAT_RGB8", image.format)
-    for side in ("height", "width"):
-        if getattr(image, side) != IMAGE_SIZE:
-            raise invalid(f"{field}.{side}", IMAGE_SIZE, getattr(image, side))
-    if len(image.data) != IMAGE_BYTES:
-        raise invalid(f"{field}.data", f"{IMAGE_BYTES} bytes", len(image.data))
-    return np.frombuffer(image.data, np.uint8).reshape(IMAGE_SIZE, IMAGE_SIZE, 3)
 
 
 def action_to_proto(action: NDArray[np.float32]) -> types_pb2.Action:
