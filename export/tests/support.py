@@ -19,7 +19,7 @@ SIZE, STATE_SIZE, ACTION_SIZE = 84, 39, 4
 def _messages() -> dict[str, Any]:
     with tempfile.NamedTemporaryFile() as file:
         options = [f"-I{PROTO}", f"--descriptor_set_out={file.name}", "--include_imports"]
-        assert protoc.main(["", *options, "cpn/v1/recording.proto"]) == 0
+        assert protoc.main(["", *options, "cpn/v1/demonstration.proto"]) == 0
         return GetMessages(FileDescriptorSet.FromString(file.read()).file)
 
 
@@ -69,7 +69,7 @@ class Sample:
         for t, action in enumerate(actions):
             for part in (self.frames[t], action, self.states[t], self.rewards[t], self.successes[t]):
                 digest.update(part.tobytes())
-        header = MESSAGES["cpn.v1.EpisodeHeader"](
+        header = MESSAGES["cpn.v1.RecordedEpisode"](
             episode_id=self.episode_id,
             variation={"task": self.task, "seed": self.seed},
             render_spec=self.render_spec,

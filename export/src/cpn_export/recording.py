@@ -1,4 +1,4 @@
-"""Reads recordings: MCAP files of one episode each, as `proto/cpn/v1/recording.proto` describes them."""
+"""Reads recordings: MCAP files of one episode each, as `proto/cpn/v1/demonstration.proto` describes them."""
 
 import hashlib
 from collections import defaultdict
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cpn_export.error import ExportError
 
 EPISODE, CAMERA, STEP = "/episode", "/camera", "/step"
-SCHEMAS = {EPISODE: "cpn.v1.EpisodeHeader", CAMERA: "foxglove.RawImage", STEP: "cpn.v1.RecordedStep"}
+SCHEMAS = {EPISODE: "cpn.v1.RecordedEpisode", CAMERA: "foxglove.RawImage", STEP: "cpn.v1.RecordedStep"}
 
 
 @dataclass(frozen=True)
