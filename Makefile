@@ -45,8 +45,8 @@ dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check t
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
-export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (OUT=folder)
-	$(EXPORT)/bin/cpn-export-lerobot --dataset data/demonstrations --out $(or $(OUT),data/lerobot)
+export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (DATASET=folder, OUT=folder)
+	$(EXPORT)/bin/cpn-export-lerobot --dataset $(or $(DATASET),data/demonstrations) --out $(or $(OUT),data/lerobot)
 
 test: setup ## Everything that must pass
 	cargo test --workspace --locked
