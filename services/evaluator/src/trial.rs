@@ -8,6 +8,9 @@ use wire::{Code, Error, Image, Message, key, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
+/// Variations that are tried for the goal of an ablation.
+const GOAL_TRIES: u32 = 10;
+
 /// How to reach the planner and the workers.
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
@@ -42,15 +45,11 @@ pub(crate) enum Fault {
 
 impl From<Error> for Fault {
     fn from(error: Error) -> Self {
-        match error.code {
-            Code::FailedPrecondition if ["variation.seed", "goal_seed"].contains(&error.field.as_str()) => {
-                Self::NoGoalImage
-            }
-            Code::InvalidArgument => Self::Refused(error),
-            // Pictures of two renderings: they will not get alike by trying again.
-            Code::FailedPrecondition if error.field.ends_with("render_spec") || error.field == "goal_id" => {
-                Self::Refused(error)
-            }
+        match (error.code, error.field.as_str()) {
+            (Code::FailedPrecondition, "variation.seed" | "goal_seed") => Self::NoGoalImage,
+            // A worker without the task's simulator; pictures of two renderings.
+            (Code::FailedPrecondition, "variation.task" | "goal_id" | "observation.render_spec")
+            | (Code::InvalidArgument, _) => Self::Refused(error),
             _ => Self::Broken(error),
         }
     }
@@ -64,12 +63,7 @@ pub(crate) async fn attempt(
     variation: &Variation,
     goal: GoalSource,
 ) -> Result<Attempt, Fault> {
-    let goal_seed = match goal {
-        GoalSource::SameVariation => None,
-        GoalSource::OtherVariation => Some(variation.seed + 1),
-    };
-    let reset = ResetRequest { variation: variation.clone(), goal_seed };
-    let reset: ResetResponse = link.call(key::sim_reset(worker)?, reset).await?;
+    let reset = link.reset(worker, variation, goal).await?;
     let mut goal_id = link.register_goal(&reset.goal).await?;
     let step_key = key::sim_step(worker)?;
     let mut log = Log::default();
@@ -114,6 +108,23 @@ fn plan_seed(variation: u64, step: u32) -> u64 {
 impl Link {
     async fn call<Q: Message, R: Message>(&self, key: OwnedKeyExpr, request: Q) -> Result<R, Error> {
         query::call(&self.session, &key, request, self.timeout).await
+    }
+
+    async fn reset(&self, worker: &str, variation: &Variation, goal: GoalSource) -> Result<ResetResponse, Error> {
+        let mut goal_seed = match goal {
+            GoalSource::SameVariation => None,
+            GoalSource::OtherVariation => Some(variation.seed + 1),
+        };
+        let mut left = GOAL_TRIES;
+        loop {
+            left -= 1;
+            let request = ResetRequest { variation: variation.clone(), goal_seed };
+            match self.call(key::sim_reset(worker)?, request).await {
+                // The expert does not solve the other variation: the next one will do as well.
+                Err(error) if error.field == "goal_seed" && left > 0 => goal_seed = goal_seed.map(|seed| seed + 1),
+                answer => return answer,
+            }
+        }
     }
 
     async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
@@ -194,6 +205,7 @@ mod tests {
             let ResetRequest { variation, goal_seed } = query::request::<ResetRequest>(query).unwrap();
             let result = match goal_seed.unwrap_or(variation.seed) {
                 13 => Err(Error::new(Code::FailedPrecondition, "goal_seed", "another", 13)),
+                100.. => Err(Error::new(Code::FailedPrecondition, "goal_seed", "another", 100)),
                 _ if variation.task == "unknown" => Err(Error::invalid("variation.task", "a task", "unknown")),
                 _ => Ok(ResetResponse {
                     episode_id: "e".into(),
@@ -273,10 +285,12 @@ mod tests {
         let fault = async |worker: &str, digest: &str, variation: Variation| {
             attempt(&link, worker, &model(digest), &variation, GoalSource::SameVariation).await.unwrap_err()
         };
-        // The expert solves seed 12, but not the one after, whose goal is to be shown.
+        // The expert solves none of the variations whose goal could be shown.
         let goal = GoalSource::OtherVariation;
-        let other = attempt(&link, "w", &model(DIGEST), &variation("reach", 12), goal).await;
+        let other = attempt(&link, "w", &model(DIGEST), &variation("reach", 99), goal).await;
         assert!(matches!(other, Err(Fault::NoGoalImage)));
+        // It solves seed 12, not 13, and the one after, whose goal is shown instead.
+        attempt(&link, "w", &model(DIGEST), &variation("reach", 12), goal).await.unwrap();
         assert!(matches!(fault("w", DIGEST, variation("reach", 13)).await, Fault::NoGoalImage));
         assert!(
             matches!(fault("w", DIGEST, variation("unknown", 1)).await, Fault::Refused(e) if e.field == "variation.task")
