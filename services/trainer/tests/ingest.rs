@@ -89,8 +89,7 @@ async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
     for step in &mut steps {
         step.frame = step.frame.clone().rendered_as("other").unwrap();
     }
-    let info = RecordedEpisode { render_spec: "other".into(), ..info("reach", 2, &steps) };
-    let other = Episode::new(info, steps).unwrap();
+    let other = Episode::new(info("reach", 2, &steps), steps).unwrap();
     let error = replay::send(&worker, &other).await.unwrap_err();
     assert_eq!(error, Error::new(Code::FailedPrecondition, "render_spec", common::SPEC, "other"));
     assert_eq!(files(folder.path()).len(), 1);

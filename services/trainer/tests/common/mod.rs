@@ -49,7 +49,7 @@ pub fn info(task: &str, seed: u64, steps: &[DemonstrationStep]) -> RecordedEpiso
         digest: digest(steps),
         goal_position: Vec::new(),
         control_hz: 80.0,
-        render_spec: SPEC.to_owned(),
+        render_spec: steps[0].frame.render_spec().to_owned(),
     }
 }
 
