@@ -30,7 +30,7 @@ async fn a_recorder_that_is_killed_loses_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-#[ignore = "takes minutes: `cargo test -p trainer --test crash -- --ignored`"]
+#[ignore = "takes a minute: `make test-crash`"]
 async fn a_recorder_that_is_killed_a_hundred_times_loses_nothing() {
     survives(100, "tcp/127.0.0.1:17492").await;
 }
