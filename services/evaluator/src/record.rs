@@ -166,7 +166,8 @@ impl Folder {
         if self.path("run.json").exists() {
             let got = self.read_run()?.goal;
             let folder = self.root.display();
-            ensure!(got == goal, "--out: expected a folder for goals of {goal:?}, got {folder} with those of {got:?}");
+            let (expected, found) = (serde_json::to_string(&goal)?, serde_json::to_string(&got)?);
+            ensure!(got == goal, "--out: expected a folder of --goal {expected}, got {folder} of {found}");
         }
         Ok(())
     }

@@ -238,5 +238,11 @@ async fn what_cannot_be_evaluated_is_named() {
     assert!(!ended.success);
     assert!(ended.stderr.contains("refused: variation.task: expected one of assembly, "));
     assert!(ended.stderr.contains("got 'reach-the-moon'"));
+
+    // The folder is now that of a run with goals of the same variation.
+    let ended = lab.evaluate(&["--tasks", "reach", "--goal", "other-variation"]).await;
+    assert!(!ended.success);
+    assert!(ended.stderr.contains("--out: expected a folder of --goal \"other-variation\", got "));
+    assert!(ended.stderr.contains("of \"same-variation\""));
     lab.stop_planner().await;
 }

@@ -19,7 +19,7 @@ pub enum Command {
     Serve(ServeArgs),
     /// Train a method; the same command goes on where an interrupted one stopped.
     Train(TrainArgs),
-    /// Send recordings as the stream that a worker sends.
+    /// Send recordings to a recorder, as the workers did.
     Replay(ReplayArgs),
     /// Fetch what another recorder keeps, then follow it.
     Mirror(MirrorArgs),

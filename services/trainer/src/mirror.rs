@@ -7,18 +7,21 @@ use recording::Episode;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::Notify;
+use tokio::time::Instant;
 use tracing::{info, warn};
 use wire::demonstration::{DemonstrationStep, MAX_STEPS, RecordedEpisode};
 use wire::{Code, Error, key, query};
 use zenoh::Session;
+use zenoh::handlers::RingChannel;
 
 /// Most episodes that a network may hold.
 const MAX_EPISODES: usize = 100_000;
 /// How long an answer may take: a list, or the steps of an episode.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// How often is asked anew, should an announcement be lost.
-const POLL_INTERVAL: Duration = Duration::from_secs(5);
+/// How often everything is asked for anew, should an announcement be lost.
+const POLL_INTERVAL: Duration = Duration::from_secs(30);
+/// Announcements that may wait; of more, the oldest are lost.
+const ANNOUNCEMENTS: usize = 256;
 
 /// Fetches every episode that others keep and `recordings` lacks.
 ///
@@ -34,23 +37,27 @@ pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(),
     attempt.retry(patience()).when(is_passing).await
 }
 
-/// Does the same now and whenever an episode is announced, for as long as it is polled.
+/// Does the same, and then fetches each episode as it is announced, for as long as it is polled.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
 pub async fn follow(session: &Session, recordings: &Arc<Recordings>) -> zenoh::Result<()> {
-    let announced = Arc::new(Notify::new());
-    let notify = Arc::clone(&announced);
-    let _announcements =
-        session.declare_subscriber(key::demonstration_recorded("*")?).callback(move |_| notify.notify_one()).await?;
+    let announcements =
+        session.declare_subscriber(key::demonstration_recorded("*")?).with(RingChannel::new(ANNOUNCEMENTS)).await?;
     loop {
         match pass(session, recordings).await {
             Ok(Pass { offered, fetched }) if fetched > 0 => info!(offered, fetched, "mirrored"),
             Ok(_) => {}
             Err(error) => warn!(%error, "not mirrored; tried again"),
         }
-        // Elapsing is as good as being told.
-        let _ = tokio::time::timeout(POLL_INTERVAL, announced.notified()).await;
+        let next_pass = Instant::now() + POLL_INTERVAL;
+        while let Ok(announcement) = tokio::time::timeout_at(next_pass, announcements.recv_async()).await {
+            let episode = wire::decode(&announcement?.payload().to_bytes());
+            let taken = async { take(session, recordings, episode?).await };
+            if let Err(error) = taken.await {
+                warn!(%error, "not mirrored; tried again");
+            }
+        }
     }
 }
 
@@ -66,14 +73,22 @@ async fn pass(session: &Session, recordings: &Arc<Recordings>) -> Result<Pass, E
     let mut failed = None;
     let mut pass = Pass { offered: offered.len(), fetched: 0 };
     for episode in offered {
-        let id = episode.episode_id.clone();
-        let result = match recordings.lacks(&episode) {
-            Ok(true) => fetch(session, recordings, episode).await.map(|()| pass.fetched += 1),
-            other => other.map(drop),
-        };
-        failed = result.map_err(|e| e.within(&id)).err().or(failed);
+        match take(session, recordings, episode).await {
+            Ok(fetched) => pass.fetched += usize::from(fetched),
+            Err(error) => failed = Some(error),
+        }
     }
     failed.map_or(Ok(pass), Err)
+}
+
+/// Fetches an episode that is offered, if it is lacking; answers whether it was.
+async fn take(session: &Session, recordings: &Arc<Recordings>, offered: RecordedEpisode) -> Result<bool, Error> {
+    let id = offered.episode_id.clone();
+    let lacking = recordings.lacks(&offered).map_err(|e| e.within(&id))?;
+    if lacking {
+        fetch(session, recordings, offered).await.map_err(|e| e.within(&id))?;
+    }
+    Ok(lacking)
 }
 
 /// Fetches one episode; it is kept only if it has the digest that was announced.

@@ -48,7 +48,7 @@ impl Recordings {
         }
         let mut index = Index::default();
         for path in paths(&folder)? {
-            let header = || anyhow::Ok(check_place(&folder, &path, recording::read_header(&path)?)?);
+            let header = || check_place(&folder, &path, recording::read_header(&path)?);
             let info = match header() {
                 Ok(info) => info,
                 Err(error) => {

@@ -1,4 +1,4 @@
-//! Sends recordings as the very stream that a worker sends.
+//! Sends recordings: the steps that a worker sent, as far as a recorder lacks them.
 
 use crate::recordings;
 use anyhow::{Context, ensure};

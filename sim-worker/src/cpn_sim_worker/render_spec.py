@@ -6,7 +6,7 @@ carries the spec of its rendering, recordings and checkpoints keep it, and whoev
 
 import json
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import version
 
 
@@ -33,6 +33,11 @@ class RenderSpec:
 
     def __str__(self) -> str:
         """The spec as JSON, the same text for the same spec."""
+        return self._json
+
+    @cached_property
+    def _json(self) -> str:
+        """Made once, since every frame carries it."""
         return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
 
 

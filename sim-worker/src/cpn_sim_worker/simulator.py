@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from cpn_sim_worker.jenga import JengaScene
 from cpn_sim_worker.metaworld_scene import MetaWorldScene
 from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.render_spec import RenderSpec
 from cpn_sim_worker.scene import Scene, Transition
 from cpn_sim_worker.tasks import TASKS, check_task
 
@@ -34,6 +33,7 @@ class Simulator:
         """
         if task != self._task:
             self.scene = _load(task)
+            self.render_spec = self._renderer.spec(self.scene)
             self._task = task
 
     def reset(self, task: str, seed: int) -> NDArray[np.float64]:
@@ -52,10 +52,5 @@ class Simulator:
         return self.scene.step(action)
 
     def frame(self) -> NDArray[np.uint8]:
-        """The camera's image of the current state: [84, 84, 3], RGB."""
+        """The camera's image of the current state, [84, 84, 3], RGB, as `render_spec` tells."""
         return self._renderer.render(self.scene)
-
-    @property
-    def render_spec(self) -> RenderSpec:
-        """How `frame` renders."""
-        return self._renderer.spec(self.scene)
