@@ -1,7 +1,7 @@
 """The demonstration stream: sends an episode until the trainer has kept it."""
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import zenoh
@@ -14,9 +14,7 @@ from cpn_sim_worker.wire import RequestError, decode, encoding
 
 COMMIT_TIMEOUT_SECONDS = 5.0
 TRAINER_PATIENCE_SECONDS = 120.0
-"""How long the trainer may be away before a demonstration gives up."""
-MAX_COMMITS = 10
-"""Commits of one episode after which its steps are taken to be lost for good."""
+"""How long the trainer may be away, or miss steps, before a demonstration gives up."""
 LOOKUP_TIMEOUT_SECONDS = 2.0
 
 
@@ -69,36 +67,36 @@ def send_episode(
         RequestError: If the trainer refuses the episode.
         UnavailableError: If the trainer stays away.
     """
-    commit = demonstration_pb2.CommitEpisodeRequest(episode=episode)
-    missing: Collection[int] = range(len(steps))
-    for _ in range(MAX_COMMITS):
-        for number in missing:
+
+    def put(numbers: Iterable[int]) -> None:
+        for number in numbers:
             session.put(
                 keys.demonstration_step(episode.episode_id, number),
                 steps[number].SerializeToString(),
                 encoding=encoding(demonstration_pb2.DemonstrationStep),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
-        missing = _commit(session, commit)
-        if not missing:
-            return
-    raise EpisodeLostError(f"{episode.episode_id}: the trainer still misses steps after {MAX_COMMITS} commits")
+
+    # The pauses grow, so that a trainer that is still busy with what was sent is not sent ever more.
+    @retry(
+        retry=retry_if_exception(_may_pass),
+        wait=wait_exponential(multiplier=0.1, max=5),
+        stop=stop_after_delay(TRAINER_PATIENCE_SECONDS),
+        reraise=True,
+    )
+    def commit() -> None:
+        key = keys.demonstration_commit(episode.episode_id)
+        request = demonstration_pb2.CommitEpisodeRequest(episode=episode)
+        response = ask(session, key, request, demonstration_pb2.CommitEpisodeResponse, COMMIT_TIMEOUT_SECONDS)
+        if response.missing_steps:
+            put(response.missing_steps)
+            raise EpisodeLostError(f"{episode.episode_id}: the trainer misses {len(response.missing_steps)} steps")
+
+    put(range(len(steps)))
+    commit()
 
 
 def _may_pass(error: BaseException) -> bool:
     if isinstance(error, RequestError):
         return error.code in (types_pb2.ERROR_CODE_UNAVAILABLE, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED)
-    return isinstance(error, UnavailableError)
-
-
-@retry(
-    retry=retry_if_exception(_may_pass),
-    wait=wait_exponential(multiplier=0.1, max=5),
-    stop=stop_after_delay(TRAINER_PATIENCE_SECONDS),
-    reraise=True,
-)
-def _commit(session: zenoh.Session, request: demonstration_pb2.CommitEpisodeRequest) -> Collection[int]:
-    """The steps that the trainer misses."""
-    key = keys.demonstration_commit(request.episode.episode_id)
-    response = ask(session, key, request, demonstration_pb2.CommitEpisodeResponse, COMMIT_TIMEOUT_SECONDS)
-    return response.missing_steps
+    return isinstance(error, UnavailableError | EpisodeLostError)
