@@ -1,5 +1,6 @@
 import json
 import subprocess
+import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,6 +31,7 @@ class Trainer:
         self.kept: dict[str, demonstration_pb2.RecordedEpisode] = {}
         self.received: list[tuple[str, int]] = []
         self.refuse = False
+        self.seconds_per_step = 0.0
         self._subscriber = session.declare_subscriber(keys.demonstration_step("*", "*"), self._receive)
         self._queryables = [
             session.declare_queryable(keys.demonstration_commit("*"), self._commit, complete=True),
@@ -37,6 +39,7 @@ class Trainer:
         ]
 
     def _receive(self, sample: zenoh.Sample) -> None:
+        time.sleep(self.seconds_per_step)
         step = decode(Step, sample.payload.to_bytes())
         assert str(sample.key_expr) == keys.demonstration_step(step.episode_id, step.step)
         first_time = (step.episode_id, step.step) not in self.received
@@ -111,6 +114,14 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
     trainer.received.clear()
     assert demonstrate(endpoint, *options).returncode == 0
     assert trainer.received == []
+
+
+def test_slow_trainer_gets_everything(trainer: Trainer, endpoint: str) -> None:
+    """One whose commits answer long before it has come to the steps."""
+    trainer.seconds_per_step = 0.05
+    run = demonstrate(endpoint, "--tasks", "coffee-button", "--episodes", "1")
+    assert run.returncode == 0, run.stderr
+    assert set(trainer.kept) == {"coffee-button-0"}
 
 
 def test_digest_is_the_same_in_every_language() -> None:
