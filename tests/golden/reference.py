@@ -137,6 +137,7 @@ def main() -> None:
         model = {
             "method": method,
             "encoder": {
+                "kind": "image",
                 "convolutions": [{"channels": c, "kernel": k, "stride": s} for c, k, s in CONVOLUTIONS],
                 "latent": LATENT,
                 "layer_norm": True,

@@ -19,8 +19,9 @@ pub trait Method: Send {
     /// Number of actions in a plan.
     fn horizon(&self) -> i64;
 
-    /// Embeds images `[B, 84, 84, 3]` as `[B, Z]`; Z is 0 for a method that does not look.
-    fn encode(&self, images: &Tensor) -> Tensor;
+    /// Embeds observations or goals, images `[B, 84, 84, 3]` or positions `[B, 3]`, as `[B, Z]`; Z is 0 for a method that
+    /// does not look.
+    fn encode(&self, input: &Tensor) -> Tensor;
 
     /// Plans from x to x_g, both `[B, Z]`. `seed` drives whatever is random.
     fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Plan;
@@ -71,7 +72,7 @@ impl Agent {
 
     /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates.
     ///
-    /// `observations` and `goals` are `[B, 84, 84, 3]`, `actions` the demonstrated `[B, H, A]`, `mask` `[B, H]` tells
+    /// `observations` and `goals` are `[B, 84, 84, 3]` or `[B, 3]`, `actions` the demonstrated `[B, H, A]`, `mask` `[B, H]` tells
     /// which of them the demonstration has.
     pub fn outer_loss(&self, observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Tensor {
         let needs_goal = self.config.method.is_goal_conditioned() || self.config.method.plans();
@@ -117,8 +118,8 @@ impl Method for Agent {
         self.config.horizon
     }
 
-    fn encode(&self, images: &Tensor) -> Tensor {
-        tch::no_grad(|| self.encoder.encode(images))
+    fn encode(&self, input: &Tensor) -> Tensor {
+        tch::no_grad(|| self.encoder.encode(input))
     }
 
     fn plan(&self, x: &Tensor, x_g: &Tensor, _seed: u64) -> Plan {
@@ -146,8 +147,8 @@ impl Method for Random {
         1
     }
 
-    fn encode(&self, images: &Tensor) -> Tensor {
-        Tensor::zeros([images.size()[0], 0], (Kind::Float, Device::Cpu))
+    fn encode(&self, input: &Tensor) -> Tensor {
+        Tensor::zeros([input.size()[0], 0], (Kind::Float, Device::Cpu))
     }
 
     fn plan(&self, x: &Tensor, _x_g: &Tensor, seed: u64) -> Plan {

@@ -3,6 +3,9 @@
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
+/// Farthest that a position may lie from the origin: 1 km, in millimetres.
+const MAX_MM: i64 = 1_000_000;
+
 /// A learned method of the paper's comparison (section "Methods for comparison").
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -71,7 +74,7 @@ impl ConvConfig {
     }
 }
 
-/// A named encoder.
+/// A named image encoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EncoderPreset {
@@ -81,15 +84,41 @@ pub enum EncoderPreset {
     Upn,
 }
 
-/// The image encoder f_φ.
+/// The encoder f_φ, by what observations and goals are.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+pub enum EncoderConfig {
+    /// Camera images.
+    Image(ImageEncoderConfig),
+    /// Positions in space.
+    Position(PositionEncoderConfig),
+}
+
+/// The image encoder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct EncoderConfig {
+pub struct ImageEncoderConfig {
     /// Convolutions from the image on.
     pub convolutions: Vec<ConvConfig>,
     /// Z, the size of the embedding.
     pub latent: i64,
     /// Whether the embedding is layer-normalised, which keeps the inner loss on one scale.
+    pub layer_norm: bool,
+}
+
+/// The encoder of positions (section "JENGA domain on a physical robot").
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PositionEncoderConfig {
+    /// What is subtracted from a position, x, y, z. Whole millimetres, which JSON keeps exactly.
+    pub centre_mm: [i64; 3],
+    /// What the rest is divided by: one scale, so that space keeps its shape.
+    pub scale_mm: i64,
+    /// Widths of the linear layers before the last, each followed by a rectified linear unit.
+    pub layers: Vec<i64>,
+    /// Z, the size of the embedding.
+    pub latent: i64,
+    /// Whether the embedding is layer-normalised.
     pub layer_norm: bool,
 }
 
@@ -106,16 +135,16 @@ impl EncoderConfig {
     /// Our reading of the paper's encoder, whose widths stand only in a figure: the three convolutions customary for
     /// 84×84 images, and a latent of 64.
     pub fn paper() -> Self {
-        Self {
+        Self::Image(ImageEncoderConfig {
             convolutions: vec![ConvConfig::new(32, 8, 4), ConvConfig::new(64, 4, 2), ConvConfig::new(64, 3, 1)],
             latent: 64,
             layer_norm: true,
-        }
+        })
     }
 
     /// The encoder of the released code of Universal Planning Networks (Srinivas et al., 2018).
     pub fn upn() -> Self {
-        Self {
+        Self::Image(ImageEncoderConfig {
             convolutions: vec![
                 ConvConfig::new(32, 8, 4),
                 ConvConfig::new(64, 4, 2),
@@ -124,9 +153,58 @@ impl EncoderConfig {
             ],
             latent: 128,
             layer_norm: false,
+        })
+    }
+
+    /// The paper's encoder for positions that lie about `centre_mm`, `scale_mm` from it or so.
+    pub fn position(centre_mm: [i64; 3], scale_mm: i64) -> Self {
+        let layers = vec![64];
+        Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 64, layer_norm: true })
+    }
+
+    /// Z, the size of the embedding.
+    pub fn latent(&self) -> i64 {
+        match self {
+            Self::Image(image) => image.latent,
+            Self::Position(position) => position.latent,
         }
     }
 
+    /// Whether the embedding is layer-normalised.
+    pub fn layer_norm(&self) -> bool {
+        match self {
+            Self::Image(image) => image.layer_norm,
+            Self::Position(position) => position.layer_norm,
+        }
+    }
+
+    fn validate(&self) -> Result<(), ConfigError> {
+        match self {
+            Self::Image(image) => {
+                in_range("encoder.convolutions", image.convolutions.len() as i64, 1, 8)?;
+                for conv in &image.convolutions {
+                    in_range("encoder.convolutions.channels", conv.channels, 1, 128)?;
+                    in_range("encoder.convolutions.kernel", conv.kernel, 1, 8)?;
+                    in_range("encoder.convolutions.stride", conv.stride, 1, 16)?;
+                }
+                in_range("encoder output size in pixels", image.output_size().unwrap_or(0), 1, 16)?;
+            }
+            Self::Position(position) => {
+                for centre in position.centre_mm {
+                    in_range("encoder.centre_mm", centre, -MAX_MM, MAX_MM)?;
+                }
+                in_range("encoder.scale_mm", position.scale_mm, 1, MAX_MM)?;
+                in_range("encoder.layers", position.layers.len() as i64, 0, 8)?;
+                for &width in &position.layers {
+                    in_range("encoder.layers.width", width, 1, 512)?;
+                }
+            }
+        }
+        in_range("encoder.latent", self.latent(), 1, 512)
+    }
+}
+
+impl ImageEncoderConfig {
     /// Width and height in pixels after the last convolution; `None` if the image is used up before.
     pub fn output_size(&self) -> Option<i64> {
         self.convolutions.iter().try_fold(crate::images::SIZE, |size, conv| {
@@ -168,17 +246,7 @@ impl ModelConfig {
     /// # Errors
     /// Names the first field out of its range, what was expected and what came.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let in_range = |field, value: i64, min, max| {
-            if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { field, value, min, max }) }
-        };
-        in_range("encoder.convolutions", self.encoder.convolutions.len() as i64, 1, 8)?;
-        for conv in &self.encoder.convolutions {
-            in_range("encoder.convolutions.channels", conv.channels, 1, 128)?;
-            in_range("encoder.convolutions.kernel", conv.kernel, 1, 8)?;
-            in_range("encoder.convolutions.stride", conv.stride, 1, 16)?;
-        }
-        in_range("encoder output size in pixels", self.encoder.output_size().unwrap_or(0), 1, 16)?;
-        in_range("encoder.latent", self.encoder.latent, 1, 512)?;
+        self.encoder.validate()?;
         in_range("hidden", self.hidden, 1, 256)?;
         in_range("gate_hidden", self.gate_hidden, 1, 64)?;
         in_range("actions", self.actions, 1, 32)?;
@@ -190,6 +258,10 @@ impl ModelConfig {
             in_range("updates", self.updates, 0, 0)
         }
     }
+}
+
+fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), ConfigError> {
+    if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { field, value, min, max }) }
 }
 
 /// A configuration value out of its range.

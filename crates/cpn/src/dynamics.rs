@@ -19,7 +19,7 @@ impl PolicyDynamics {
     /// goal conditioning where the method has them.
     pub fn new(path: &nn::Path, config: &ModelConfig) -> Self {
         let ModelConfig { method, hidden, actions, .. } = *config;
-        let latent = config.encoder.latent;
+        let latent = config.encoder.latent();
         let dense = |name: &str, inputs, outputs| Dense::new(&(path / name), inputs, outputs, config);
         let context = if method.is_goal_conditioned() { latent } else { 0 };
         Self {

@@ -1,43 +1,41 @@
-//! The image encoder f_φ, shared by observation and goal (figure "encoder", a).
+//! The encoder f_φ, shared by observation and goal (figure "encoder", a).
 
-use crate::config::EncoderConfig;
-use crate::images;
+use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
+use crate::{images, positions};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
 
-/// Convolutions, then a linear layer to the embedding.
+/// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]
 pub struct Encoder {
-    convolutions: Vec<nn::Conv2D>,
+    body: Body,
     linear: nn::Linear,
     layer_norm: Option<nn::LayerNorm>,
+}
+
+/// From the input to features, `[B, F]`.
+#[derive(Debug)]
+enum Body {
+    Image { convolutions: Vec<nn::Conv2D> },
+    Position { centre_metres: Tensor, scale_metres: f64, layers: Vec<nn::Linear> },
 }
 
 impl Encoder {
     /// Builds the encoder's variables under `path`. The configuration must be valid.
     pub fn new(path: &nn::Path, config: &EncoderConfig) -> Self {
-        let mut channels = images::CHANNELS;
-        let mut convolutions = Vec::new();
-        for (i, conv) in config.convolutions.iter().enumerate() {
-            let options = nn::ConvConfig { stride: conv.stride, ..Default::default() };
-            convolutions.push(nn::conv2d(path / "conv" / i, channels, conv.channels, conv.kernel, options));
-            channels = conv.channels;
-        }
-        let size = config.output_size().expect("validated configuration");
-        let linear = nn::linear(path / "linear", channels * size * size, config.latent, Default::default());
-        let layer_norm =
-            config.layer_norm.then(|| nn::layer_norm(path / "norm", vec![config.latent], Default::default()));
-        Self { convolutions, linear, layer_norm }
+        let (body, features) = match config {
+            EncoderConfig::Image(config) => Body::image(path, config),
+            EncoderConfig::Position(config) => Body::position(path, config),
+        };
+        let latent = config.latent();
+        let linear = nn::linear(path / "linear", features, latent, Default::default());
+        let layer_norm = config.layer_norm().then(|| nn::layer_norm(path / "norm", vec![latent], Default::default()));
+        Self { body, linear, layer_norm }
     }
 
-    /// Embeds images: `[B, 84, 84, 3]` bytes to `[B, Z]`.
-    pub fn encode(&self, images: &Tensor) -> Tensor {
-        let kind = self.linear.ws.kind();
-        let mut y = images.permute([0, 3, 1, 2]).to_kind(kind) / 255.0 - 0.5;
-        for conv in &self.convolutions {
-            y = conv.forward(&y).relu();
-        }
-        let x = self.linear.forward(&y.flatten(1, -1));
+    /// Embeds images, `[B, 84, 84, 3]` bytes, or positions, `[B, 3]` in metres, as `[B, Z]`.
+    pub fn encode(&self, input: &Tensor) -> Tensor {
+        let x = self.linear.forward(&self.body.features(input, self.kind()));
         match &self.layer_norm {
             Some(norm) => norm.forward(&x),
             None => x,
@@ -47,5 +45,51 @@ impl Encoder {
     /// The kind of the weights: float, or double in gradient checks.
     pub fn kind(&self) -> Kind {
         self.linear.ws.kind()
+    }
+}
+
+impl Body {
+    /// The convolutions, and F.
+    fn image(path: &nn::Path, config: &ImageEncoderConfig) -> (Self, i64) {
+        let mut channels = images::CHANNELS;
+        let mut convolutions = Vec::new();
+        for (i, conv) in config.convolutions.iter().enumerate() {
+            let options = nn::ConvConfig { stride: conv.stride, ..Default::default() };
+            convolutions.push(nn::conv2d(path / "conv" / i, channels, conv.channels, conv.kernel, options));
+            channels = conv.channels;
+        }
+        let size = config.output_size().expect("validated configuration");
+        (Self::Image { convolutions }, channels * size * size)
+    }
+
+    /// The linear layers, and F.
+    fn position(path: &nn::Path, config: &PositionEncoderConfig) -> (Self, i64) {
+        let mut width = positions::SIZE;
+        let mut layers = Vec::new();
+        for (i, &outputs) in config.layers.iter().enumerate() {
+            layers.push(nn::linear(path / "layer" / i, width, outputs, Default::default()));
+            width = outputs;
+        }
+        let centre_metres = Tensor::from_slice(&config.centre_mm.map(|mm| mm as f64 / 1e3));
+        (Self::Position { centre_metres, scale_metres: config.scale_mm as f64 / 1e3, layers }, width)
+    }
+
+    fn features(&self, input: &Tensor, kind: Kind) -> Tensor {
+        match self {
+            Self::Image { convolutions } => {
+                let mut y = input.permute([0, 3, 1, 2]).to_kind(kind) / 255.0 - 0.5;
+                for conv in convolutions {
+                    y = conv.forward(&y).relu();
+                }
+                y.flatten(1, -1)
+            }
+            Self::Position { centre_metres, scale_metres, layers } => {
+                let mut y = (input - centre_metres).to_kind(kind) / *scale_metres;
+                for layer in layers {
+                    y = layer.forward(&y).relu();
+                }
+                y
+            }
+        }
     }
 }

@@ -13,11 +13,11 @@
 //! | U | `updates` | gradient updates of a plan |
 //! | Z | `latent` | size of an embedding |
 //! | A | `actions` | continuous actions of the robot |
-//! | o_t, o_g | `observation`, `goal` | images, `[B, 84, 84, 3]`, 8 bits |
+//! | o_t, o_g | `observation`, `goal` | images, `[B, 84, 84, 3]`, 8 bits; or positions, `[B, 3]`, metres |
 //! | x_t, x_g | `x`, `x_g` | their embeddings, `[B, Z]` |
 //! | â_{t:t+H} | `Plan::actions` | planned actions, `[B, H, A]` |
 //!
-//! Tensors are validated once, where bytes become tensors ([`images`], [`checkpoint`]); past that edge a wrong shape is a
+//! Tensors are validated once, where bytes become tensors ([`images`], [`positions`], [`checkpoint`]); past that edge a wrong shape is a
 //! bug and `tch` panics.
 
 pub mod agent;
@@ -30,6 +30,7 @@ pub mod images;
 pub mod loss;
 pub mod neuromodulated;
 pub mod planner;
+pub mod positions;
 
 pub use agent::{Agent, Method, Random};
 pub use config::{EncoderConfig, EncoderPreset, MethodKind, ModelConfig};

@@ -4,10 +4,10 @@
 
 mod common;
 
-use common::{noise_images, small_config};
+use common::{noise_images, position_config, small_config};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, Method, MethodKind};
+use cpn::{Agent, Method, MethodKind, positions};
 use serde_json::{Value, json};
 
 fn provenance() -> Provenance {
@@ -33,14 +33,16 @@ fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
 
 #[test]
 fn a_checkpoint_comes_back_whole() {
-    for method in MethodKind::ALL {
-        let agent = Agent::new(small_config(method), 5);
+    let (images, positions) = (noise_images(1, 1), positions::from_metres(&[[0.5, 0.1, 0.2]]));
+    let methods = MethodKind::ALL.into_iter();
+    for (config, input) in methods.flat_map(|m| [(small_config(m), &images), (position_config(m), &positions)]) {
+        let agent = Agent::new(config, 5);
         let bytes = checkpoint::to_bytes(&agent, &provenance()).unwrap();
         let loaded = checkpoint::from_bytes(&bytes).unwrap();
         assert_eq!(loaded.agent.config(), agent.config());
         assert_eq!(loaded.provenance, provenance());
-        let x = agent.encode(&noise_images(1, 1));
-        assert_eq!(loaded.agent.encode(&noise_images(1, 1)), x);
+        let x = agent.encode(input);
+        assert_eq!(loaded.agent.encode(input), x);
         assert_eq!(loaded.agent.plan(&x, &x, 0).actions, agent.plan(&x, &x, 0).actions);
         assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
@@ -112,4 +114,19 @@ fn a_configuration_out_of_range_builds_nothing() {
     assert_eq!(message, "checkpoint model: encoder.convolutions.kernel: expected 1 to 8, got 0");
     let message = refusal(|_, metadata| metadata["model"]["depth"] = json!(3));
     assert!(message.contains("unknown field `depth`"), "{message}");
+    let message = refusal(|_, metadata| metadata["model"]["encoder"]["kind"] = json!("sound"));
+    assert!(message.contains("unknown variant `sound`"), "{message}");
+    let position = |spoil: fn(&mut Value)| {
+        let mut encoder = serde_json::to_value(position_config(MethodKind::Cpn).encoder).unwrap();
+        spoil(&mut encoder);
+        refusal(|_, metadata| metadata["model"]["encoder"] = encoder)
+    };
+    let message = position(|encoder| encoder["scale_mm"] = json!(0));
+    assert_eq!(message, "checkpoint model: encoder.scale_mm: expected 1 to 1000000, got 0");
+    let message = position(|encoder| encoder["centre_mm"][2] = json!(-2_000_000));
+    assert_eq!(message, "checkpoint model: encoder.centre_mm: expected -1000000 to 1000000, got -2000000");
+    let message = position(|encoder| encoder["layers"][0] = json!(1_000_000));
+    assert_eq!(message, "checkpoint model: encoder.layers.width: expected 1 to 512, got 1000000");
+    let message = position(|encoder| encoder["centre_mm"] = json!([1, 2]));
+    assert!(message.starts_with("checkpoint metadata: "), "{message}");
 }

@@ -4,10 +4,10 @@
 
 mod common;
 
-use common::{double_agent, noise_images, small_config, uniform};
+use common::{double_agent, noise_images, position_config, small_config, uniform};
 use cpn::neuromodulated::Neuromodulated;
 use cpn::planner::InnerLoop;
-use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Random};
+use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Random, positions};
 use tch::nn::{self, Module};
 use tch::{Device, Kind, Tensor};
 
@@ -17,7 +17,11 @@ fn max_difference(a: &Tensor, b: &Tensor) -> f64 {
 
 /// A batch for the outer loss: observations, goals, demonstrated actions, mask.
 fn batch(config: &ModelConfig, size: i64) -> (Tensor, Tensor, Tensor, Tensor) {
-    let (observations, goals) = (noise_images(size, 1), noise_images(size, 2));
+    let inputs = |seed| match config.encoder {
+        EncoderConfig::Image(_) => noise_images(size, seed),
+        EncoderConfig::Position(_) => uniform(&[size, 3], seed),
+    };
+    let (observations, goals) = (inputs(1), inputs(2));
     let actions = uniform(&[size, config.horizon, config.actions], 3);
     (observations, goals, actions, Tensor::ones([size, config.horizon], (Kind::Double, Device::Cpu)))
 }
@@ -26,8 +30,10 @@ fn batch(config: &ModelConfig, size: i64) -> (Tensor, Tensor, Tensor, Tensor) {
 /// components of every weight tensor.
 #[test]
 fn outer_gradients_match_finite_differences() {
-    for method in MethodKind::ALL {
-        let agent = double_agent(small_config(method));
+    let methods = MethodKind::ALL.into_iter();
+    for config in methods.flat_map(|method| [small_config(method), position_config(method)]) {
+        let method = config.method;
+        let agent = double_agent(config);
         let (observations, goals, actions, mask) = batch(agent.config(), 3);
         let loss = || agent.outer_loss(&observations, &goals, &actions, &mask);
         loss().backward();
@@ -174,15 +180,32 @@ fn random_actions_follow_the_seed() {
     assert!(plan(1).abs().max().double_value(&[]) <= 1.0);
 }
 
+/// The same place, told from two origins and in two units, is the same to the encoder.
+#[test]
+fn positions_are_standardised() {
+    let embed = |centre_mm, scale_mm, position| {
+        let encoder = EncoderConfig::position(centre_mm, scale_mm);
+        let config = ModelConfig { encoder, ..position_config(MethodKind::Cpn) };
+        Agent::new(config, 0).encode(&positions::from_metres(&[position]))
+    };
+    let (near, far) = (embed([0; 3], 100, [0.1, -0.05, 0.02]), embed([700, 200, -300], 200, [0.9, 0.1, -0.26]));
+    assert!(max_difference(&near, &far) < 1e-5);
+    assert!(max_difference(&near, &embed([0; 3], 100, [0.1, -0.05, 0.03])) > 1e-3);
+}
+
 #[test]
 fn every_preset_builds() {
-    for encoder in [EncoderConfig::paper(), EncoderConfig::upn()] {
+    for encoder in [EncoderConfig::paper(), EncoderConfig::upn(), EncoderConfig::position([500, 0, 200], 100)] {
         for method in MethodKind::ALL {
             let config = ModelConfig { encoder: encoder.clone(), ..ModelConfig::paper(method) };
             config.validate().unwrap();
             let agent = Agent::new(config, 0);
-            let x = agent.encode(&noise_images(2, 0));
-            assert_eq!(x.size(), [2, encoder.latent]);
+            let inputs = match encoder {
+                EncoderConfig::Image(_) => noise_images(2, 0),
+                EncoderConfig::Position(_) => positions::from_metres(&[[0.5, 0.0, 0.2]; 2]),
+            };
+            let x = agent.encode(&inputs);
+            assert_eq!(x.size(), [2, encoder.latent()]);
             assert_eq!(agent.plan(&x, &x, 0).actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
         }
     }

@@ -2,7 +2,7 @@
 
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use cpn::config::ConvConfig;
+use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
 use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -10,15 +10,22 @@ use tch::Tensor;
 
 /// A model with few weights.
 pub fn small_config(method: MethodKind) -> ModelConfig {
-    let encoder = EncoderConfig {
+    let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
             ConvConfig { channels: 3, kernel: 8, stride: 8 },
             ConvConfig { channels: 4, kernel: 4, stride: 3 },
         ],
         latent: 6,
         layer_norm: true,
-    };
+    });
     ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) }
+}
+
+/// The same model for positions in a box of 2 m.
+pub fn position_config(method: MethodKind) -> ModelConfig {
+    let (centre_mm, scale_mm, layers) = ([500, 0, -200], 400, vec![7, 5]);
+    let encoder = PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 6, layer_norm: true };
+    ModelConfig { encoder: EncoderConfig::Position(encoder), actions: 3, ..small_config(method) }
 }
 
 /// An agent in float64, so that gradients can be told from rounding.

@@ -4,7 +4,7 @@
 #![expect(clippy::unwrap_used, reason = "tests")]
 
 use cpn::checkpoint::{self, Provenance};
-use cpn::config::ConvConfig;
+use cpn::config::{ConvConfig, ImageEncoderConfig};
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
 use planner::model::Model;
@@ -212,14 +212,14 @@ pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
 
 /// A checkpoint of few, random weights, trained on pictures that were rendered in one way.
 pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u8> {
-    let encoder = EncoderConfig {
+    let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
             ConvConfig { channels: 3, kernel: 8, stride: 8 },
             ConvConfig { channels: 4, kernel: 4, stride: 3 },
         ],
         latent: 6,
         layer_norm: true,
-    };
+    });
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
     let provenance =
