@@ -37,7 +37,8 @@ impl Adam {
     }
 
     /// Updates the weights from their gradients, scaled down to `max_norm` if together they are longer, and clears them.
-    pub fn step(&mut self, learning_rate: f64, max_norm: f64) {
+    /// Answers how long they were.
+    pub fn step(&mut self, learning_rate: f64, max_norm: f64) -> f64 {
         let _no_grad = tch::no_grad_guard();
         // A method may leave a weight unused: BC has no step size to learn.
         let used = || self.weights.iter().map(|weight| weight.value.grad()).filter(Tensor::defined);
@@ -60,6 +61,7 @@ impl Adam {
             let _ = value.g_sub_(&(&*mean / denominator * (learning_rate / bias_1)));
             let _ = gradient.zero_();
         }
+        norm
     }
 
     /// Weights and moments by name.

@@ -2,7 +2,8 @@
 //!
 //! Two processes that meet in the file system, so that neither can take the other down: the service ([`service`]) keeps
 //! every committed episode ([`ingest`], [`recorder`]) and offers every finished checkpoint to the planners
-//! ([`publish`]); a training run ([`train`]) reads the episodes ([`dataset`]) and writes a checkpoint. Recordings
+//! ([`publish`]); a training run ([`train`]) reads the episodes ([`dataset`]), tells how far it is ([`progress`]) and
+//! writes a checkpoint. Recordings
 //! ([`recordings`]) can be sent again ([`replay`]), copied from another recorder ([`mirror`]), and checked ([`verify`]).
 
 pub mod adam;
@@ -10,6 +11,7 @@ pub mod dataset;
 pub mod episode;
 pub mod ingest;
 pub mod mirror;
+pub mod progress;
 pub mod publish;
 pub mod recorder;
 pub mod recordings;

@@ -9,6 +9,7 @@ use cli::{Cli, Command, MirrorArgs, ReplayArgs, VerifyArgs};
 use service_kit::{config, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use trainer::progress::{Bar, Observer, StopIf};
 use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
 use trainer::{mirror, replay, service, verify};
@@ -40,7 +41,11 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
 async fn train(config: train::Config) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&stop);
-    let mut run = tokio::task::spawn_blocking(move || train::run(&config, &|_| seen.load(Ordering::Relaxed)));
+    let mut run = tokio::task::spawn_blocking(move || {
+        let stopped = StopIf(move |_| seen.load(Ordering::Relaxed));
+        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), Box::new(Bar::new(config.method.name()))];
+        train::run(&config, &mut observers)
+    });
     let outcome = tokio::select! {
         outcome = &mut run => outcome??,
         signal = shutdown::requested() => {

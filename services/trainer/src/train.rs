@@ -2,11 +2,11 @@
 
 use crate::adam::Adam;
 use crate::dataset::Dataset;
+use crate::progress::{Meter, Observer};
 use anyhow::{Context, ensure};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
 use cpn::{Agent, EncoderPreset, MethodKind, ModelConfig};
-use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::f64::consts::PI;
@@ -85,15 +85,16 @@ struct ResumePoint {
     config: Config,
     data_digest: String,
     step: u64,
+    /// Running mean of the loss, for those who watch.
+    loss: Option<f64>,
 }
 
-/// Trains until the checkpoint is written or `stop`, asked before each step with the number of steps done, says so; from
-/// a saved state if there is one.
+/// Trains until the checkpoint is written or `observer` stops it; from a saved state if there is one.
 ///
 /// # Errors
-/// If the demonstrations cannot be read, the saved state belongs to another run, the loss is no longer finite, or a file
-/// cannot be written.
-pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcome> {
+/// If the demonstrations cannot be read, the saved state belongs to another run, the loss is no longer finite, a file
+/// cannot be written, or the observer fails.
+pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outcome> {
     ensure!(config.batch_size > 0 && config.epochs > 0, "batch_size and epochs: expected at least 1, got 0");
     if config.threads > 0 {
         tch::set_num_threads(config.threads);
@@ -111,18 +112,21 @@ pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcom
     let agent = Agent::new(model, config.seed);
     let mut adam = Adam::new(agent.variables());
     let resume_path = config.out.with_extension("resume");
-    let mut step = resume(&resume_path, config, &dataset, &mut adam)?;
+    let (mut step, loss) = resume(&resume_path, config, &dataset, &mut adam)?;
 
-    let per_epoch = dataset.sample_count().div_ceil(config.batch_size) as u64;
+    let sample_count = dataset.sample_count() as u64;
+    let per_epoch = sample_count.div_ceil(config.batch_size as u64);
     let total = per_epoch * u64::from(config.epochs);
-    let progress = Progress::new(config, total, step);
+    let samples_done = step / per_epoch * sample_count + step % per_epoch * config.batch_size as u64;
+    let mut meter = Meter::new(total, config.epochs.into(), samples_done, loss);
+    observer.begin(step)?;
     let mut saved = Instant::now();
     while step < total {
         let epoch = step / per_epoch;
         let samples = dataset.shuffled(config.seed, epoch);
         for samples in samples.chunks(config.batch_size).skip((step % per_epoch) as usize) {
-            if stop(step) {
-                save(&resume_path, config, &dataset, &adam, step)?;
+            if observer.should_stop(step) {
+                save(&resume_path, config, &dataset, &adam, step, &meter)?;
                 return Ok(Outcome::Interrupted { step });
             }
             let batch = dataset.batch(samples, agent.config().horizon);
@@ -130,15 +134,15 @@ pub fn run(config: &Config, stop: &dyn Fn(u64) -> bool) -> anyhow::Result<Outcom
             let value = loss.double_value(&[]);
             ensure!(value.is_finite(), "loss: expected a finite number, got {value} at step {step}");
             loss.backward();
-            adam.step(one_cycle(step, total, config.peak_learning_rate), config.max_gradient_norm);
+            let learning_rate = one_cycle(step, total, config.peak_learning_rate);
+            let norm = adam.step(learning_rate, config.max_gradient_norm);
             step += 1;
-            progress.step(step, value, samples.len());
+            observer.observe(&meter.step(step, samples.len(), value, learning_rate, norm))?;
             if saved.elapsed() > SAVE_INTERVAL {
-                save(&resume_path, config, &dataset, &adam, step)?;
+                save(&resume_path, config, &dataset, &adam, step, &meter)?;
                 saved = Instant::now();
             }
         }
-        progress.epoch(epoch + 1);
     }
 
     let provenance = Provenance {
@@ -165,15 +169,16 @@ fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
     low + (peak - low) * 0.5 * (1.0 + (PI * progress).cos())
 }
 
-fn save(path: &Path, config: &Config, dataset: &Dataset, adam: &Adam, step: u64) -> anyhow::Result<()> {
-    let point = ResumePoint { config: config.clone(), data_digest: dataset.digest().to_owned(), step };
+fn save(path: &Path, config: &Config, dataset: &Dataset, adam: &Adam, step: u64, meter: &Meter) -> anyhow::Result<()> {
+    let data_digest = dataset.digest().to_owned();
+    let point = ResumePoint { config: config.clone(), data_digest, step, loss: meter.loss };
     files::write_atomically(path, &archive::to_bytes(&adam.state(), &point)?)
 }
 
-/// Takes up a saved state; answers the number of steps done.
-fn resume(path: &Path, config: &Config, dataset: &Dataset, adam: &mut Adam) -> anyhow::Result<u64> {
+/// Takes up a saved state; answers the number of steps done and the mean loss.
+fn resume(path: &Path, config: &Config, dataset: &Dataset, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
     if !path.exists() {
-        return Ok(0);
+        return Ok((0, None));
     }
     let mut take_up = || {
         let (state, point): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(path)?)?;
@@ -182,45 +187,7 @@ fn resume(path: &Path, config: &Config, dataset: &Dataset, adam: &mut Adam) -> a
         ensure!(same_run, "expected the state of this run, {expected:?}, got that of another, {point:?}");
         adam.restore(&state, i32::try_from(point.step)?)?;
         info!(step = point.step, "resumed");
-        Ok(point.step)
+        Ok((point.step, point.loss))
     };
     take_up().with_context(|| format!("resuming from {} (remove it to start anew)", path.display()))
-}
-
-/// A bar on a terminal, a line for each epoch in the log.
-struct Progress {
-    bar: ProgressBar,
-    /// A running mean of the loss.
-    loss: std::cell::Cell<f64>,
-    samples: std::cell::Cell<u64>,
-    started: Instant,
-}
-
-impl Progress {
-    fn new(config: &Config, total: u64, step: u64) -> Self {
-        let style = "{prefix:>5} {wide_bar} {pos}/{len} steps, {msg}, {eta} left";
-        let bar = ProgressBar::new(total)
-            .with_style(ProgressStyle::with_template(style).expect("a valid template"))
-            .with_prefix(config.method.name())
-            .with_position(step);
-        bar.reset_eta();
-        Self { bar, loss: f64::NAN.into(), samples: 0.into(), started: Instant::now() }
-    }
-
-    fn step(&self, step: u64, loss: f64, samples: usize) {
-        let mean = self.loss.get();
-        self.loss.set(if mean.is_nan() { loss } else { 0.98 * mean + 0.02 * loss });
-        self.samples.set(self.samples.get() + samples as u64);
-        self.bar.set_position(step);
-        self.bar.set_message(format!("loss {:.4}, {:.0} samples/s", self.loss.get(), self.samples_per_second()));
-    }
-
-    fn epoch(&self, epoch: u64) {
-        let (loss, rate) = (format!("{:.4}", self.loss.get()), format!("{:.0}", self.samples_per_second()));
-        self.bar.suspend(|| info!(epoch, loss, samples_per_second = rate, "epoch done"));
-    }
-
-    fn samples_per_second(&self) -> f64 {
-        self.samples.get() as f64 / self.started.elapsed().as_secs_f64()
-    }
 }

@@ -8,6 +8,7 @@ use common::{SPEC, episode, info, keep, steps};
 use cpn::{EncoderConfig, EncoderPreset, MethodKind, checkpoint};
 use recording::Episode;
 use std::path::Path;
+use trainer::progress::{Observer, Progress, StopIf};
 use trainer::train::{self, Config, Outcome};
 
 fn config(folder: &Path, name: &str) -> Config {
@@ -22,7 +23,7 @@ fn config(folder: &Path, name: &str) -> Config {
 }
 
 fn finished(config: &Config) -> String {
-    match train::run(config, &|_| false).unwrap() {
+    match train::run(config, &mut StopIf(|_| false)).unwrap() {
         Outcome::Finished { digest } => digest,
         Outcome::Interrupted { step } => panic!("interrupted at {step}"),
     }
@@ -34,19 +35,72 @@ fn an_interrupted_run_ends_with_the_same_weights() {
     let whole = finished(&config(folder.path(), "whole"));
     let broken = config(folder.path(), "broken");
     for stop_at in [0, 2, 5] {
-        assert_eq!(train::run(&broken, &|step| step == stop_at).unwrap(), Outcome::Interrupted { step: stop_at });
+        assert_eq!(
+            train::run(&broken, &mut StopIf(|step| step == stop_at)).unwrap(),
+            Outcome::Interrupted { step: stop_at }
+        );
         assert!(!broken.out.exists(), "no checkpoint before the end");
     }
     assert_eq!(finished(&broken), whole);
     assert!(!broken.out.with_extension("resume").exists());
 }
 
+/// Notes what it hears until it has heard of so many steps.
+struct Notes {
+    began: Vec<u64>,
+    heard: Vec<Progress>,
+    until: u64,
+}
+
+impl Observer for Notes {
+    fn begin(&mut self, step: u64) -> anyhow::Result<()> {
+        self.began.push(step);
+        Ok(())
+    }
+
+    fn should_stop(&self, step: u64) -> bool {
+        step == self.until
+    }
+
+    fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
+        self.heard.push(*progress);
+        Ok(())
+    }
+}
+
+/// What is told of a run that was interrupted is what is told of one that was not.
+#[test]
+fn progress_goes_on_after_an_interruption() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut whole = Notes { began: Vec::new(), heard: Vec::new(), until: u64::MAX };
+    train::run(&config(folder.path(), "whole"), &mut whole).unwrap();
+    let mut broken = Notes { began: Vec::new(), heard: Vec::new(), until: 5 };
+    let config = config(folder.path(), "broken");
+    train::run(&config, &mut broken).unwrap();
+    broken.until = u64::MAX;
+    train::run(&config, &mut broken).unwrap();
+    assert_eq!((whole.began, broken.began), (vec![0], vec![0, 5]));
+
+    let timeless = |heard: Vec<Progress>| -> Vec<Progress> {
+        heard.into_iter().map(|progress| Progress { samples_per_second: 0.0, ..progress }).collect()
+    };
+    let (whole, broken) = (timeless(whole.heard), timeless(broken.heard));
+    assert_eq!(whole, broken);
+    // 21 samples in batches of 6, twice.
+    assert_eq!(whole.iter().map(|progress| progress.samples).collect::<Vec<_>>(), [6, 12, 18, 21, 27, 33, 39, 42]);
+    assert_eq!(whole.iter().map(|progress| progress.epoch).collect::<Vec<_>>(), [0, 0, 0, 1, 1, 1, 1, 2]);
+    let ends: Vec<u64> = whole.iter().filter(|progress| progress.ends_epoch()).map(|progress| progress.step).collect();
+    assert_eq!(ends, [4, 8]);
+    assert!(whole.iter().all(|progress| progress.gradient_norm > 0.0 && progress.learning_rate > 0.0));
+    assert!(whole.windows(2).all(|pair| pair[0].loss != pair[1].loss));
+}
+
 #[test]
 fn a_state_of_another_run_is_not_taken_up() {
     let folder = tempfile::tempdir().unwrap();
     let first = config(folder.path(), "same");
-    train::run(&first, &|step| step == 1).unwrap();
-    let error = train::run(&Config { seed: 5, ..first }, &|_| false).unwrap_err();
+    train::run(&first, &mut StopIf(|step| step == 1)).unwrap();
+    let error = train::run(&Config { seed: 5, ..first }, &mut StopIf(|_| false)).unwrap_err();
     assert!(format!("{error:#}").contains("expected the state of this run"), "{error:#}");
 }
 
@@ -100,7 +154,7 @@ fn training_lowers_the_loss() {
 fn bad_input_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let good = config(folder.path(), "x");
-    let refused = |config: &Config| format!("{:#}", train::run(config, &|_| false).unwrap_err());
+    let refused = |config: &Config| format!("{:#}", train::run(config, &mut StopIf(|_| false)).unwrap_err());
 
     let message = refused(&Config { hold_out: vec!["door-lokc".into()], ..good.clone() });
     assert!(message.contains("hold_out: expected some of [\"door-lock\", \"reach\"], got \"door-lokc\""), "{message}");

@@ -1,0 +1,162 @@
+//! How far a training run is, and who is told.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+use tracing::info;
+
+/// How much of the running mean of the loss a step takes over.
+const LOSS_WEIGHT: f64 = 0.02;
+
+/// How far a run is after a step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Steps done.
+    pub step: u64,
+    /// Steps of the whole run.
+    pub steps: u64,
+    /// Passes over every sample that are complete.
+    pub epoch: u64,
+    /// Passes of the whole run.
+    pub epochs: u64,
+    /// Samples that were trained on, counted once for each pass.
+    pub samples: u64,
+    /// Running mean of the outer loss.
+    pub loss: f64,
+    /// Learning rate of the step.
+    pub learning_rate: f64,
+    /// Norm of the gradient over all weights, before it was clipped.
+    pub gradient_norm: f64,
+    /// Samples that this process trained on in a second, since it began.
+    pub samples_per_second: f64,
+}
+
+/// Watches a run, and may end it.
+pub trait Observer {
+    /// Hears that the run begins, or goes on, after so many steps.
+    ///
+    /// # Errors
+    /// If what was noted before cannot be taken up.
+    fn begin(&mut self, _step: u64) -> anyhow::Result<()> {
+        Ok(())
+    }
+
+    /// Whether the run shall save its state and end; asked before each step with the number of steps done.
+    fn should_stop(&self, _step: u64) -> bool {
+        false
+    }
+
+    /// Hears of each step.
+    ///
+    /// # Errors
+    /// If it cannot be noted.
+    fn observe(&mut self, _progress: &Progress) -> anyhow::Result<()> {
+        Ok(())
+    }
+}
+
+/// Several observers as one: each hears everything, and any may end the run.
+impl Observer for Vec<Box<dyn Observer>> {
+    fn begin(&mut self, step: u64) -> anyhow::Result<()> {
+        self.iter_mut().try_for_each(|observer| observer.begin(step))
+    }
+
+    fn should_stop(&self, step: u64) -> bool {
+        self.iter().any(|observer| observer.should_stop(step))
+    }
+
+    fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
+        self.iter_mut().try_for_each(|observer| observer.observe(progress))
+    }
+}
+
+/// Ends a run as soon as the function, given the number of steps done, says so.
+#[derive(Debug)]
+pub struct StopIf<F>(pub F);
+
+impl<F: Fn(u64) -> bool> Observer for StopIf<F> {
+    fn should_stop(&self, step: u64) -> bool {
+        self.0(step)
+    }
+}
+
+/// A bar on a terminal, a line for each epoch in the log.
+#[derive(Debug)]
+pub struct Bar(ProgressBar);
+
+impl Bar {
+    /// A bar of a run of this name.
+    pub fn new(name: &str) -> Self {
+        let style = "{prefix:>5} {wide_bar} {pos}/{len} steps, {msg}, {eta} left";
+        let style = ProgressStyle::with_template(style).expect("a valid template");
+        Self(ProgressBar::no_length().with_style(style).with_prefix(name.to_owned()))
+    }
+}
+
+impl Observer for Bar {
+    fn begin(&mut self, step: u64) -> anyhow::Result<()> {
+        self.0.set_position(step);
+        self.0.reset_eta();
+        Ok(())
+    }
+
+    fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
+        let Progress { step, steps, epoch, loss, samples_per_second, .. } = *progress;
+        self.0.set_length(steps);
+        self.0.set_position(step);
+        self.0.set_message(format!("loss {loss:.4}, {samples_per_second:.0} samples/s"));
+        if progress.ends_epoch() {
+            let (loss, rate) = (format!("{loss:.4}"), format!("{samples_per_second:.0}"));
+            self.0.suspend(|| info!(epoch, loss, samples_per_second = rate, "epoch done"));
+        }
+        Ok(())
+    }
+}
+
+impl Progress {
+    /// Whether the step was the last of its epoch.
+    pub fn ends_epoch(&self) -> bool {
+        (self.step * self.epochs).is_multiple_of(self.steps)
+    }
+}
+
+/// Turns what is known of single steps into the progress of a run.
+#[derive(Debug)]
+pub(crate) struct Meter {
+    /// Steps of the whole run.
+    steps: u64,
+    /// Passes of the whole run.
+    epochs: u64,
+    /// Samples that were trained on.
+    samples: u64,
+    /// Running mean of the outer loss; none before the first step.
+    pub(crate) loss: Option<f64>,
+    /// When this process began, and how many samples there were then.
+    began: (Instant, u64),
+}
+
+impl Meter {
+    pub(crate) fn new(steps: u64, epochs: u64, samples: u64, loss: Option<f64>) -> Self {
+        Self { steps, epochs, samples, loss, began: (Instant::now(), samples) }
+    }
+
+    /// The progress with one more step on so many samples, after which `step` are done.
+    pub(crate) fn step(&mut self, step: u64, samples: usize, loss: f64, learning_rate: f64, norm: f64) -> Progress {
+        let Self { steps, epochs, began: (instant, before), .. } = *self;
+        self.samples += samples as u64;
+        let loss = self.loss.map_or(loss, |mean| mean + LOSS_WEIGHT * (loss - mean));
+        self.loss = Some(loss);
+        Progress {
+            step,
+            steps,
+            epoch: step * epochs / steps,
+            epochs,
+            samples: self.samples,
+            loss,
+            learning_rate,
+            gradient_norm: norm,
+            samples_per_second: (self.samples - before) as f64 / instant.elapsed().as_secs_f64(),
+        }
+    }
+}
