@@ -85,12 +85,21 @@ impl Agent {
             let x_g = x.zeros_like();
             (x, x_g)
         };
-        let planned = if self.config.method.plans() {
-            self.inner_loop().plan_differentiably(&x, &x_g).actions
+        loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), actions, mask)
+    }
+
+    /// The planned actions `[B, H, A]` from x to x_g, both `[B, Z]`, with their graph.
+    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
+        if self.config.method.plans() {
+            self.inner_loop().plan_differentiably(x, x_g).actions
         } else {
-            self.react(&x, &x_g)
-        };
-        loss::behaviour_cloning(&planned, actions, mask)
+            self.react(x, x_g)
+        }
+    }
+
+    /// The image encoder.
+    pub fn encoder(&self) -> &Encoder {
+        &self.encoder
     }
 
     /// The inner loop of a planning method.

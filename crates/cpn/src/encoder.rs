@@ -5,6 +5,9 @@ use crate::{images, positions};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
 
+/// The kind that the processor multiplies fastest.
+const HALF: Kind = Kind::BFloat16;
+
 /// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]
 pub struct Encoder {
@@ -16,8 +19,15 @@ pub struct Encoder {
 /// From the input to features, `[B, F]`.
 #[derive(Debug)]
 enum Body {
-    Image { convolutions: Vec<nn::Conv2D> },
+    Image { convolutions: Vec<Convolution> },
     Position { centre_metres: Tensor, scale_metres: f64, layers: Vec<nn::Linear> },
+}
+
+/// A convolution, and its stride in pixels, which the library keeps to itself.
+#[derive(Debug)]
+struct Convolution {
+    layer: nn::Conv2D,
+    stride: i64,
 }
 
 impl Encoder {
@@ -35,7 +45,36 @@ impl Encoder {
 
     /// Embeds images, `[B, 84, 84, 3]` bytes, or positions, `[B, 3]` in metres, as `[B, Z]`.
     pub fn encode(&self, input: &Tensor) -> Tensor {
-        let x = self.linear.forward(&self.body.features(input, self.kind()));
+        self.normalise(self.linear.forward(&self.body.features(input, self.kind())))
+    }
+
+    /// The same, with the convolutions and the linear layer on images computed in bfloat16: weights, sums and what comes
+    /// after stay in float32. Positions are embedded as ever.
+    pub fn encode_in_bfloat16(&self, input: &Tensor) -> Tensor {
+        let Body::Image { convolutions } = &self.body else { return self.encode(input) };
+        // Whole numbers up to 255 are exact in bfloat16, so that the weights take on the scaling of the pixels:
+        // w (p / 255 - 1/2) + b = (w / 255) p + (b - Σw / 2).
+        let mut y = input.permute([0, 3, 1, 2]).to_kind(HALF);
+        for (i, Convolution { layer, stride }) in convolutions.iter().enumerate() {
+            let bias = layer.bs.as_ref().expect("built with a bias");
+            let (weight, bias) = if i == 0 {
+                let sums = layer.ws.sum_dim_intlist([1, 2, 3].as_slice(), false, None::<Kind>);
+                (&layer.ws / 255.0, bias - sums / 2.0)
+            } else {
+                (layer.ws.shallow_clone(), bias.shallow_clone())
+            };
+            let weight = channels_last(&weight.to_kind(HALF));
+            y = y.conv2d(&weight, Some(bias.to_kind(HALF)), [*stride; 2], [0, 0], [1, 1], 1).relu_();
+        }
+        // The features lie with their channels last; the weights are turned rather than them.
+        let (_, channels, size, _) = y.size4().expect("a batch of feature maps");
+        let weight = self.linear.ws.view([-1, channels, size, size]).permute([0, 2, 3, 1]).flatten(1, -1);
+        let features = y.permute([0, 2, 3, 1]).flatten(1, -1);
+        let x = features.matmul(&weight.to_kind(HALF).tr()).to_kind(Kind::Float);
+        self.normalise(x + self.linear.bs.as_ref().expect("built with a bias"))
+    }
+
+    fn normalise(&self, x: Tensor) -> Tensor {
         match &self.layer_norm {
             Some(norm) => norm.forward(&x),
             None => x,
@@ -48,6 +87,11 @@ impl Encoder {
     }
 }
 
+/// Lays a tensor out with its channels last in memory, which is the order that the library's convolutions like best.
+fn channels_last(tensor: &Tensor) -> Tensor {
+    tensor.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
+}
+
 impl Body {
     /// The convolutions, and F.
     fn image(path: &nn::Path, config: &ImageEncoderConfig) -> (Self, i64) {
@@ -55,7 +99,8 @@ impl Body {
         let mut convolutions = Vec::new();
         for (i, conv) in config.convolutions.iter().enumerate() {
             let options = nn::ConvConfig { stride: conv.stride, ..Default::default() };
-            convolutions.push(nn::conv2d(path / "conv" / i, channels, conv.channels, conv.kernel, options));
+            let layer = nn::conv2d(path / "conv" / i, channels, conv.channels, conv.kernel, options);
+            convolutions.push(Convolution { layer, stride: conv.stride });
             channels = conv.channels;
         }
         let size = config.output_size().expect("validated configuration");
@@ -78,8 +123,8 @@ impl Body {
         match self {
             Self::Image { convolutions } => {
                 let mut y = input.permute([0, 3, 1, 2]).to_kind(kind) / 255.0 - 0.5;
-                for conv in convolutions {
-                    y = conv.forward(&y).relu();
+                for Convolution { layer, .. } in convolutions {
+                    y = layer.forward(&y).relu();
                 }
                 y.flatten(1, -1)
             }

@@ -26,6 +26,7 @@ pub mod checkpoint;
 pub mod config;
 pub mod dynamics;
 pub mod encoder;
+pub mod fused;
 pub mod images;
 pub mod loss;
 pub mod neuromodulated;

@@ -1,0 +1,95 @@
+//! Numbers side by side in a register of the processor, as wide as it has them.
+
+use super::real::Real;
+use pulp::Simd;
+use std::ops::{Add, Mul, Sub};
+
+/// As many numbers as fill a register.
+#[derive(Debug)]
+pub struct Lanes<S: Simd, T: Real> {
+    simd: S,
+    values: T::Lanes<S>,
+}
+
+impl<S: Simd, T: Real> Clone for Lanes<S, T> {
+    #[inline(always)]
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<S: Simd, T: Real> Copy for Lanes<S, T> {}
+
+impl<S: Simd, T: Real> Lanes<S, T> {
+    /// How many.
+    pub const COUNT: usize = size_of::<T::Lanes<S>>() / size_of::<T>();
+
+    /// The same number everywhere.
+    #[inline(always)]
+    pub fn splat(simd: S, value: T) -> Self {
+        Self { simd, values: T::splat(simd, value) }
+    }
+
+    /// The first numbers of a slice; zeros where it ends.
+    #[inline(always)]
+    pub fn load(simd: S, slice: &[T]) -> Self {
+        Self { simd, values: T::load(simd, slice) }
+    }
+
+    /// Writes over the first numbers of a slice, as many as it has.
+    #[inline(always)]
+    pub fn store(self, slice: &mut [T]) {
+        T::store(self.simd, slice, self.values);
+    }
+
+    /// Adds to the first numbers of a slice.
+    #[inline(always)]
+    pub fn add_to(self, slice: &mut [T]) {
+        (Self::load(self.simd, slice) + self).store(slice);
+    }
+
+    /// `self * factor + summand`, rounded once.
+    #[inline(always)]
+    pub fn mul_add(self, factor: Self, summand: Self) -> Self {
+        Self { values: T::mul_add(self.simd, self.values, factor.values, summand.values), ..self }
+    }
+
+    /// σ of each.
+    #[inline(always)]
+    pub fn sigmoid(self) -> Self {
+        Self { values: T::sigmoids(self.simd, self.values), ..self }
+    }
+
+    /// The sum.
+    #[inline(always)]
+    pub fn sum(self) -> T {
+        T::sum_lanes(self.simd, self.values)
+    }
+}
+
+impl<S: Simd, T: Real> Add for Lanes<S, T> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        Self { values: T::add_lanes(self.simd, self.values, other.values), ..self }
+    }
+}
+
+impl<S: Simd, T: Real> Sub for Lanes<S, T> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        Self { values: T::sub_lanes(self.simd, self.values, other.values), ..self }
+    }
+}
+
+impl<S: Simd, T: Real> Mul for Lanes<S, T> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        Self { values: T::mul_lanes(self.simd, self.values, other.values), ..self }
+    }
+}

@@ -1,0 +1,219 @@
+//! The numbers that the fused core is written in: float32 to train with, float64 to check it by.
+
+use pulp::Simd;
+use std::fmt::Debug;
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
+
+/// A floating-point number, and registers full of it.
+pub trait Real:
+    Copy
+    + Debug
+    + Default
+    + PartialOrd
+    + Send
+    + Sync
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + AddAssign
+    + SubAssign
+    + Sum
+    + 'static
+{
+    /// 0.
+    const ZERO: Self;
+    /// 1.
+    const ONE: Self;
+    /// A register.
+    type Lanes<S: Simd>: Copy + Debug;
+
+    /// A count as a number.
+    fn count(n: usize) -> Self;
+    /// The hyperbolic tangent.
+    fn tanh(self) -> Self;
+    /// 1 / (1 + e^-x).
+    fn sigmoid(self) -> Self;
+
+    /// The same number everywhere.
+    fn splat<S: Simd>(simd: S, value: Self) -> Self::Lanes<S>;
+    /// The first numbers of a slice; zeros where it ends.
+    fn load<S: Simd>(simd: S, slice: &[Self]) -> Self::Lanes<S>;
+    /// Writes over the first numbers of a slice, as many as it has.
+    fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: Self::Lanes<S>);
+    /// a + b.
+    fn add_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
+    /// a - b.
+    fn sub_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
+    /// a b.
+    fn mul_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
+    /// a b + c.
+    fn mul_add<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>, c: Self::Lanes<S>) -> Self::Lanes<S>;
+    /// The sum of all.
+    fn sum_lanes<S: Simd>(simd: S, lanes: Self::Lanes<S>) -> Self;
+    /// σ of each.
+    fn sigmoids<S: Simd>(simd: S, lanes: Self::Lanes<S>) -> Self::Lanes<S>;
+}
+
+/// What differs between the two kinds only in the names of the library's functions.
+macro_rules! real {
+    ($real:ident, $lanes:ident, $count:ident, $splat:ident, $as_simd:ident, $as_mut_simd:ident, $partial_load:ident, $partial_store:ident, $add:ident, $sub:ident,
+     $mul:ident, $mul_add:ident, $sum:ident) => {
+        const ZERO: Self = 0.0;
+        const ONE: Self = 1.0;
+        type Lanes<S: Simd> = S::$lanes;
+
+        #[inline(always)]
+        fn count(n: usize) -> Self {
+            n as Self
+        }
+
+        #[inline(always)]
+        fn tanh(self) -> Self {
+            self.tanh()
+        }
+
+        #[inline(always)]
+        fn sigmoid(self) -> Self {
+            1.0 / (1.0 + (-self).exp())
+        }
+
+        #[inline(always)]
+        fn splat<S: Simd>(simd: S, value: Self) -> S::$lanes {
+            simd.$splat(value)
+        }
+
+        #[inline(always)]
+        fn load<S: Simd>(simd: S, slice: &[Self]) -> S::$lanes {
+            match slice.get(..S::$count).map(S::$as_simd) {
+                Some((&[lanes], _)) => lanes,
+                _ => simd.$partial_load(slice),
+            }
+        }
+
+        #[inline(always)]
+        fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: S::$lanes) {
+            match slice.get_mut(..S::$count).map(S::$as_mut_simd) {
+                Some(([first], _)) => *first = lanes,
+                _ => simd.$partial_store(slice, lanes),
+            }
+        }
+
+        #[inline(always)]
+        fn add_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+            simd.$add(a, b)
+        }
+
+        #[inline(always)]
+        fn sub_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+            simd.$sub(a, b)
+        }
+
+        #[inline(always)]
+        fn mul_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+            simd.$mul(a, b)
+        }
+
+        #[inline(always)]
+        fn mul_add<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes, c: S::$lanes) -> S::$lanes {
+            simd.$mul_add(a, b, c)
+        }
+
+        #[inline(always)]
+        fn sum_lanes<S: Simd>(simd: S, lanes: S::$lanes) -> Self {
+            simd.$sum(lanes)
+        }
+    };
+}
+
+impl Real for f64 {
+    real!(
+        f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, as_mut_simd_f64s, partial_load_f64s, partial_store_f64s, add_f64s, sub_f64s, mul_f64s,
+        mul_add_f64s, reduce_sum_f64s
+    );
+
+    #[inline(always)]
+    fn sigmoids<S: Simd>(simd: S, lanes: S::f64s) -> S::f64s {
+        // The widest registers hold eight; this is only for checks.
+        let mut values = [0.0; 8];
+        simd.partial_store_f64s(&mut values[..S::F64_LANES], lanes);
+        simd.partial_load_f64s(&values.map(Real::sigmoid)[..S::F64_LANES])
+    }
+}
+
+impl Real for f32 {
+    real!(
+        f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, as_mut_simd_f32s, partial_load_f32s, partial_store_f32s, add_f32s, sub_f32s, mul_f32s,
+        mul_add_f32s, reduce_sum_f32s
+    );
+
+    #[inline(always)]
+    fn sigmoids<S: Simd>(simd: S, lanes: S::f32s) -> S::f32s {
+        let one = simd.splat_f32s(1.0);
+        simd.div_f32s(one, simd.add_f32s(one, exp(simd, simd.neg_f32s(lanes))))
+    }
+}
+
+/// e^x to about two units in the last place: 2^n times a polynomial of the rest, which lies within half a power of two
+/// (Cephes' minimax coefficients).
+#[inline(always)]
+fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
+    let splat = |value: f32| simd.splat_f32s(value);
+    // Beyond, float32 has neither room nor digits; a sigmoid is 0 or 1 long before.
+    let x = simd.min_f32s(simd.max_f32s(x, splat(-87.0)), splat(88.0));
+    // Adding this rounds to a whole number, which then stands in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    let shifted = simd.mul_add_f32s(x, splat(std::f32::consts::LOG2_E), splat(ROUND));
+    let n = simd.sub_f32s(shifted, splat(ROUND));
+    let rest = simd.mul_add_f32s(n, splat(-0.693_359_4), x);
+    let rest = simd.mul_add_f32s(n, splat(2.121_944_4e-4), rest);
+    let mut power = splat(1.987_569_1e-4);
+    for coefficient in [1.398_2e-3, 8.333_452e-3, 4.166_579_6e-2, 1.666_666_5e-1, 0.5] {
+        power = simd.mul_add_f32s(power, rest, splat(coefficient));
+    }
+    let fraction = simd.mul_add_f32s(simd.mul_f32s(power, rest), rest, simd.add_f32s(rest, splat(1.0)));
+    let bias = simd.splat_u32s(127u32.wrapping_sub(ROUND.to_bits()));
+    let exponent = simd.add_u32s(simd.transmute_u32s_f32s(shifted), bias);
+    let scale = simd.wrapping_dyn_shl_u32s(exponent, simd.splat_u32s(23));
+    simd.mul_f32s(fraction, simd.transmute_f32s_u32s(scale))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pulp::{Arch, WithSimd};
+
+    struct Sigmoids<'a, T>(&'a mut [T]);
+
+    impl<T: Real> WithSimd for Sigmoids<'_, T> {
+        type Output = ();
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) {
+            let lanes = size_of::<T::Lanes<S>>() / size_of::<T>();
+            for chunk in self.0.chunks_mut(lanes) {
+                let values = T::load(simd, chunk);
+                T::store(simd, chunk, T::sigmoids(simd, values));
+            }
+        }
+    }
+
+    #[test]
+    fn sigmoids_are_exact_enough() {
+        let inputs: Vec<f32> = (-87_000..88_001).map(|i| i as f32 * 1e-3).collect();
+        let mut ours = inputs.clone();
+        Arch::new().dispatch(Sigmoids(&mut ours));
+        let mut exact: Vec<f64> = inputs.iter().copied().map(f64::from).collect();
+        Arch::new().dispatch(Sigmoids(&mut exact));
+        for ((x, ours), exact) in inputs.iter().zip(ours).zip(exact) {
+            assert!((f64::from(ours) - exact).abs() < 3e-7 * exact, "sigmoid({x}): {ours} for {exact}");
+            assert!((1.0 / (1.0 + (-f64::from(*x)).exp()) - exact).abs() <= 1e-15 * exact, "sigmoid({x})");
+        }
+        let mut extremes = [f32::INFINITY, 1e30, 200.0, f32::NEG_INFINITY, -1e30];
+        Arch::new().dispatch(Sigmoids(&mut extremes));
+        assert_eq!(extremes[..3], [1.0; 3]);
+        assert!(extremes[3..].iter().all(|value| (0.0..1e-37).contains(value)), "{extremes:?}");
+    }
+}
