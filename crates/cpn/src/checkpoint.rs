@@ -3,6 +3,7 @@
 use crate::agent::Agent;
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
+use crate::recipe::Training;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -11,10 +12,10 @@ use tch::Kind;
 /// Largest checkpoint that is read, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
 /// Version of the metadata; another one is refused.
-const FORMAT: u32 = 2;
+const FORMAT: u32 = 3;
 
 /// Where a model comes from.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Tasks whose demonstrations it was trained on.
@@ -25,8 +26,8 @@ pub struct Provenance {
     pub render_spec: String,
     /// Seed of initialisation and sampling.
     pub seed: u64,
-    /// Passes over every frame.
-    pub epochs: u32,
+    /// How it was trained.
+    pub training: Training,
 }
 
 #[derive(Debug, Serialize, Deserialize)]

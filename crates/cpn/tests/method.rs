@@ -195,7 +195,7 @@ fn positions_are_standardised() {
 
 #[test]
 fn every_preset_builds() {
-    for encoder in [EncoderConfig::paper(), EncoderConfig::upn(), EncoderConfig::position([500, 0, 200], 100)] {
+    for encoder in [EncoderConfig::paper(), EncoderConfig::position([500, 0, 200], 100)] {
         for method in MethodKind::ALL {
             let config = ModelConfig { encoder: encoder.clone(), ..ModelConfig::paper(method) };
             config.validate().unwrap();

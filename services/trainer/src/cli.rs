@@ -17,8 +17,10 @@ pub struct Cli {
 pub enum Command {
     /// Keep the episodes of demonstration streams and publish the checkpoints of a folder.
     Serve(ServeArgs),
-    /// Train a method; the same command goes on where an interrupted one stopped.
+    /// Train a model; the same command goes on where an interrupted one stopped.
     Train(TrainArgs),
+    /// Print all settings of a preset, as a file that `train --config` takes.
+    Preset(PresetArgs),
     /// Send recordings to a recorder, as the workers did.
     Replay(ReplayArgs),
     /// Fetch what another recorder keeps, then follow it.
@@ -61,34 +63,34 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// Method to train: bc, te-bc, upn or cpn.
+    /// What to train: paper-bc, paper-te-bc, paper-upn, paper-cpn or cpn [default: cpn].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
-    method: Option<String>,
-    /// Encoder to train it with: paper or upn.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    encoder: Option<String>,
+    preset: Option<String>,
     /// Tasks that the model must not see.
     #[arg(long, value_delimiter = ',')]
     #[serde(skip_serializing_if = "Option::is_none")]
     hold_out: Option<Vec<String>>,
-    /// Passes over every frame.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    epochs: Option<u32>,
-    /// Samples of a step.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    batch_size: Option<usize>,
     /// Seed of initialisation and sampling.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     seed: Option<u64>,
-    /// Threads of libtorch.
+    /// Threads that compute [default: 1].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
-    threads: Option<i32>,
+    threads: Option<usize>,
+    /// Change any setting that `cpn-trainer preset` shows, for example training.epochs=8.
+    #[arg(long, value_name = "KEY=VALUE")]
+    #[serde(skip)]
+    pub set: Vec<String>,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct PresetArgs {
+    /// One of paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn.
+    #[arg(default_value = "cpn")]
+    pub name: String,
 }
 
 /// What was typed.

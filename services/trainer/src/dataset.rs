@@ -1,44 +1,36 @@
-//! The demonstrations of a training run, in memory.
+//! The demonstrations of a training run, in memory: every frame as bytes, side by side.
 
-use crate::episode::Episode;
+use crate::frame;
 use crate::recordings::{self, dataset_digest};
 use anyhow::{Context, ensure};
-use rand::SeedableRng;
-use rand::seq::SliceRandom;
-use rand_chacha::ChaCha8Rng;
+use cpn::images;
+use rayon::prelude::*;
 use std::collections::BTreeSet;
-use std::path::Path;
-use tch::{Device, Kind, Tensor};
+use std::path::{Path, PathBuf};
 use wire::demonstration::RecordedEpisode;
 
-/// Every frame with an action, of every episode that is not held out.
+/// Every frame and action of every episode that is not held out.
 #[derive(Debug)]
 pub struct Dataset {
+    /// `[frames, 84, 84, 3]`, episode after episode.
+    pixels: Vec<u8>,
+    /// `[actions, A]`, likewise.
+    actions: Vec<f32>,
+    action_size: usize,
     episodes: Vec<Episode>,
-    samples: Vec<Sample>,
     infos: Vec<RecordedEpisode>,
-    render_spec: String,
     digest: String,
 }
 
-/// A moment of an episode.
+/// Where an episode lies: T actions, and T + 1 frames before, between and after them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Sample {
-    episode: usize,
-    step: usize,
-}
-
-/// The tensors of a training step.
-#[derive(Debug)]
-pub struct Batch {
-    /// `[B, 84, 84, 3]` bytes.
-    pub observations: Tensor,
-    /// The last frames of the same episodes, `[B, 84, 84, 3]` bytes.
-    pub goals: Tensor,
-    /// The actions that follow, `[B, H, A]`; 0 past the end.
-    pub actions: Tensor,
-    /// 1 where there is an action, `[B, H]`.
-    pub mask: Tensor,
+pub struct Episode {
+    /// Its first frame among all.
+    pub first_frame: usize,
+    /// Its first action among all.
+    pub first_action: usize,
+    /// T.
+    pub action_count: usize,
 }
 
 impl Dataset {
@@ -52,39 +44,41 @@ impl Dataset {
         for task in held_out {
             ensure!(all_tasks.contains(task), "hold_out: expected some of {all_tasks:?}, got {task:?}");
         }
-        let mut dataset = Self {
-            episodes: Vec::new(),
-            samples: Vec::new(),
-            infos: Vec::new(),
-            render_spec: String::new(),
-            digest: String::new(),
-        };
         let held_out: Vec<_> = held_out.iter().map(|task| folder.join(task)).collect();
-        for path in recordings::paths(folder)? {
-            if !held_out.iter().any(|task| path.starts_with(task)) {
-                let episode = recordings::read(folder, &path)?;
-                dataset.push(&episode).with_context(|| path.display().to_string())?;
-            }
+        let mut paths = recordings::paths(folder)?;
+        paths.retain(|path| !held_out.iter().any(|task| path.starts_with(task)));
+        ensure!(!paths.is_empty(), "{}: expected demonstrations, got none", folder.display());
+        // The headers tell how much room everything takes; then each core fills in episodes.
+        let infos = paths.par_iter().map(|path| header(path)).collect::<anyhow::Result<Vec<_>>>()?;
+        let (mut episodes, mut frames) = (Vec::with_capacity(infos.len()), 0);
+        for (path, info) in paths.iter().zip(&infos) {
+            let (expected, got) = (&infos[0].render_spec, &info.render_spec);
+            let path = path.display();
+            ensure!(
+                expected == got,
+                "{path}: render_spec: expected {expected:?} like the episodes before, got {got:?}"
+            );
+            let action_count = info.steps as usize - 1;
+            episodes.push(Episode { first_frame: frames, first_action: frames - episodes.len(), action_count });
+            frames += action_count + 1;
         }
-        ensure!(!dataset.episodes.is_empty(), "{}: expected demonstrations, got none", folder.display());
-        dataset.digest = dataset_digest(&dataset.infos);
-        Ok(dataset)
-    }
-
-    fn push(&mut self, recording: &recording::Episode) -> anyhow::Result<()> {
-        let episode = Episode::from_recording(recording)?;
-        if let Some(first) = self.episodes.first() {
-            let (expected, got) = (first.actions.size()[1], episode.actions.size()[1]);
-            ensure!(expected == got, "actions: expected {expected} values like the episodes before, got {got}");
-            let (expected, got) = (&self.render_spec, &recording.info().render_spec);
-            ensure!(expected == got, "render_spec: expected {expected:?} like the episodes before, got {got:?}");
+        let mut pixels = vec![0; frames * images::BYTES];
+        let read = slots(&mut pixels, &episodes)
+            .into_par_iter()
+            .zip(&paths)
+            .map(|(slot, path)| read(folder, path, slot).with_context(|| path.display().to_string()))
+            .collect::<anyhow::Result<Vec<_>>>()?;
+        let action_size = read[0].1;
+        for ((_, got), path) in read.iter().zip(&paths) {
+            let path = path.display();
+            ensure!(
+                action_size == *got,
+                "{path}: actions: expected {action_size} values like the episodes before, got {got}"
+            );
         }
-        self.render_spec.clone_from(&recording.info().render_spec);
-        let index = self.episodes.len();
-        self.samples.extend((0..episode.action_count()).map(|step| Sample { episode: index, step }));
-        self.episodes.push(episode);
-        self.infos.push(recording.info().clone());
-        Ok(())
+        let actions = read.into_iter().flat_map(|(actions, _)| actions).collect();
+        let digest = dataset_digest(&infos);
+        Ok(Self { pixels, actions, action_size, episodes, infos, digest })
     }
 
     /// Names of the tasks, in order.
@@ -94,22 +88,22 @@ impl Dataset {
 
     /// How every frame was rendered; empty for those of a real camera.
     pub fn render_spec(&self) -> &str {
-        &self.render_spec
+        &self.infos[0].render_spec
     }
 
-    /// Number of episodes.
-    pub fn episode_count(&self) -> usize {
-        self.episodes.len()
+    /// The episodes, in the order of their files.
+    pub fn episodes(&self) -> &[Episode] {
+        &self.episodes
     }
 
     /// Number of frames with an action.
     pub fn sample_count(&self) -> usize {
-        self.samples.len()
+        self.episodes.iter().map(|episode| episode.action_count).sum()
     }
 
     /// A, the size of an action.
-    pub fn action_size(&self) -> i64 {
-        self.episodes[0].actions.size()[1]
+    pub fn action_size(&self) -> usize {
+        self.action_size
     }
 
     /// What [`dataset_digest`] gives for the episodes.
@@ -117,31 +111,44 @@ impl Dataset {
         &self.digest
     }
 
-    /// Every sample once, in an order that the seed and the epoch decide.
-    pub fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Sample> {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(epoch);
-        let mut samples = self.samples.clone();
-        samples.shuffle(&mut rng);
-        samples
+    /// The bytes `[84, 84, 3]` of a frame.
+    pub fn frame(&self, index: usize) -> &[u8] {
+        &self.pixels[index * images::BYTES..][..images::BYTES]
     }
 
-    /// The tensors of some samples, with the next H actions of each.
-    pub fn batch(&self, samples: &[Sample], horizon: i64) -> Batch {
-        let options = (Kind::Float, Device::Cpu);
-        let size = samples.len() as i64;
-        let actions = Tensor::zeros([size, horizon, self.action_size()], options);
-        let mask = Tensor::zeros([size, horizon], options);
-        let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
-        for (row, sample) in samples.iter().enumerate() {
-            let episode = &self.episodes[sample.episode];
-            let (row, step, length) = (row as i64, sample.step as i64, episode.action_count() as i64);
-            observations.push(episode.frames.get(step));
-            goals.push(episode.frames.get(length));
-            let known = horizon.min(length - step);
-            actions.get(row).narrow(0, 0, known).copy_(&episode.actions.narrow(0, step, known));
-            let _ = mask.get(row).narrow(0, 0, known).fill_(1.0);
-        }
-        Batch { observations: Tensor::stack(&observations, 0), goals: Tensor::stack(&goals, 0), actions, mask }
+    /// The actions `[count, A]` from one on.
+    pub fn actions(&self, first: usize, count: usize) -> &[f32] {
+        &self.actions[first * self.action_size..][..count * self.action_size]
     }
+}
+
+fn header(path: &PathBuf) -> anyhow::Result<RecordedEpisode> {
+    let info = recording::read_header(path).with_context(|| path.display().to_string())?;
+    ensure!(info.steps >= 2, "{}: steps: expected at least 2, got {}", path.display(), info.steps);
+    Ok(info)
+}
+
+/// Cuts the pixels into those of each episode.
+fn slots<'a>(mut pixels: &'a mut [u8], episodes: &[Episode]) -> Vec<&'a mut [u8]> {
+    let cut = |episode: &Episode| {
+        let (slot, rest) = std::mem::take(&mut pixels).split_at_mut((episode.action_count + 1) * images::BYTES);
+        pixels = rest;
+        slot
+    };
+    episodes.iter().map(cut).collect()
+}
+
+/// Copies an episode's frames into their place; answers its actions `[T, A]` and A.
+fn read(folder: &Path, path: &Path, slot: &mut [u8]) -> anyhow::Result<(Vec<f32>, usize)> {
+    let episode = recordings::read(folder, path)?;
+    let steps = episode.steps();
+    let (expected, got) = (slot.len() / images::BYTES, steps.len());
+    ensure!(expected == got, "steps: expected {expected} as the header says, got {got}");
+    for (place, step) in slot.chunks_exact_mut(images::BYTES).zip(steps) {
+        frame::check(step)?;
+        place.copy_from_slice(step.frame.data());
+    }
+    let actions: Vec<f32> = steps.iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
+    let size = actions.len() / (steps.len() - 1);
+    Ok((actions, size))
 }

@@ -7,15 +7,19 @@
 //! ([`recordings`]) can be sent again ([`replay`]), copied from another recorder ([`mirror`]), and checked ([`verify`]).
 
 pub mod adam;
+pub mod augment;
+pub mod config;
 pub mod dataset;
-pub mod episode;
+pub mod frame;
 pub mod ingest;
+pub mod learner;
 pub mod mirror;
 pub mod progress;
 pub mod publish;
 pub mod recorder;
 pub mod recordings;
 pub mod replay;
+pub mod sampler;
 pub mod service;
 pub mod train;
 pub mod verify;

@@ -5,10 +5,14 @@ mod cli;
 
 use anyhow::{anyhow, ensure};
 use clap::Parser;
-use cli::{Cli, Command, MirrorArgs, ReplayArgs, VerifyArgs};
+use cli::{Cli, Command, MirrorArgs, PresetArgs, ReplayArgs, VerifyArgs};
+use cpn::Preset;
+use serde::Deserialize;
+use serde::de::{IntoDeserializer, value};
 use service_kit::{config, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use trainer::config::Config;
 use trainer::progress::{Bar, Observer, StopIf};
 use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
@@ -22,7 +26,10 @@ async fn main() -> anyhow::Result<()> {
         Command::Serve(arguments) => {
             serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await
         }
-        Command::Train(arguments) => train(config::load("CPN_TRAIN_", arguments.config.as_deref(), &arguments)?).await,
+        Command::Train(arguments) => {
+            train(Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?).await
+        }
+        Command::Preset(arguments) => print_preset(&arguments),
         Command::Replay(arguments) => replay(arguments).await,
         Command::Mirror(arguments) => mirror(arguments).await,
         Command::Verify(arguments) => verify(&arguments),
@@ -38,12 +45,12 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
     service.shutdown().await
 }
 
-async fn train(config: train::Config) -> anyhow::Result<()> {
+async fn train(config: Config) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&stop);
     let mut run = tokio::task::spawn_blocking(move || {
         let stopped = StopIf(move |_| seen.load(Ordering::Relaxed));
-        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), Box::new(Bar::new(config.method.name()))];
+        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), Box::new(Bar::new(config.preset.name()))];
         train::run(&config, &mut observers)
     });
     let outcome = tokio::select! {
@@ -58,6 +65,12 @@ async fn train(config: train::Config) -> anyhow::Result<()> {
         Outcome::Finished { digest } => tracing::info!(digest, "checkpoint written"),
         Outcome::Interrupted { step } => tracing::info!(step, "interrupted; the same command goes on from here"),
     }
+    Ok(())
+}
+
+fn print_preset(PresetArgs { name }: &PresetArgs) -> anyhow::Result<()> {
+    let preset = Preset::deserialize(name.as_str().into_deserializer()).map_err(|e: value::Error| anyhow!(e))?;
+    print!("{}", toml::to_string(&Config::from(preset))?);
     Ok(())
 }
 

@@ -1,0 +1,82 @@
+//! What a training run can be told.
+
+use anyhow::Context;
+use cpn::{ModelConfig, Preset, Recipe, Training};
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use figment::value::Value;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// How the names of environment variables begin.
+const PREFIX: &str = "CPN_TRAIN_";
+
+/// Valid settings of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Where model and training come from, as far as nothing else is said of them.
+    pub preset: Preset,
+    /// What is trained.
+    pub model: ModelConfig,
+    /// How.
+    pub training: Training,
+    /// Folder of the demonstrations.
+    pub dataset: PathBuf,
+    /// Where the checkpoint goes.
+    pub out: PathBuf,
+    /// Tasks that the model must not see.
+    pub hold_out: Vec<String>,
+    /// Seed of initialisation and sampling.
+    pub seed: u64,
+    /// Threads that compute. The order of sums depends on their number, and with it the last bits of the weights.
+    pub threads: usize,
+    /// How often the state is saved, in seconds.
+    pub save_interval_secs: u64,
+}
+
+impl From<Preset> for Config {
+    fn from(preset: Preset) -> Self {
+        let Recipe { model, training } = preset.recipe();
+        Self {
+            preset,
+            model,
+            training,
+            dataset: "data/demonstrations".into(),
+            out: format!("runs/checkpoints/{}.safetensors", preset.name()).into(),
+            hold_out: Vec::new(),
+            seed: 0,
+            threads: 1,
+            save_interval_secs: 60,
+        }
+    }
+}
+
+impl Config {
+    /// Reads settings in layers: `changes`, each `key=value`, over what was typed over the environment over a file over the
+    /// preset, which any of them but the changes may name.
+    ///
+    /// # Errors
+    /// Names the field, what was expected and what came.
+    pub fn load(file: Option<&Path>, arguments: &impl Serialize, changes: &[String]) -> anyhow::Result<Self> {
+        let mut layers = Figment::new();
+        if let Some(file) = file {
+            layers = layers.merge(Toml::file_exact(file));
+        }
+        layers = layers.merge(Env::prefixed(PREFIX).split("__")).merge(Serialized::defaults(arguments));
+        let preset = if layers.contains("preset") { layers.extract_inner("preset")? } else { Preset::Cpn };
+        for change in changes {
+            let (key, value) = change.split_once('=').with_context(|| format!("expected key=value, got {change:?}"))?;
+            let value: Value = value.parse().with_context(|| change.clone())?;
+            layers = layers.merge((key, value));
+        }
+        let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(layers).extract()?;
+        config.recipe().validate()?;
+        Ok(config)
+    }
+
+    /// What is trained, and how.
+    pub fn recipe(&self) -> Recipe {
+        Recipe { model: self.model.clone(), training: self.training.clone() }
+    }
+}
