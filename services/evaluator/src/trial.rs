@@ -75,6 +75,8 @@ pub(crate) async fn attempt(
             observation: frames[frames.len() - 1].clone(),
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
+            // Though the planner may swap in the middle of the episode.
+            model_digest: Some(model.digest.clone()),
         };
         let mut plan = link.plan(request(&goal_id)).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
