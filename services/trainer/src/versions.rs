@@ -52,10 +52,10 @@ impl Versions {
         let mut histories = BTreeMap::new();
         for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
             let folder = entry?.path();
-            if folder.is_dir() {
-                if let Some(history) = History::read(&folder).with_context(|| folder.display().to_string())? {
-                    histories.insert(history.promoted()?.model.clone(), history);
-                }
+            if folder.is_dir()
+                && let Some(history) = History::read(&folder).with_context(|| folder.display().to_string())?
+            {
+                histories.insert(history.promoted()?.model.clone(), history);
             }
         }
         let promoted = histories.iter().map(|(model, history)| Ok((model.clone(), history.announcement()?)));

@@ -42,7 +42,7 @@ type Expected = HashMap<String, Vec<Vec<f32>>>;
 
 async fn swap(swaps: u32, endpoint: &str) {
     let folder = tempfile::tempdir().unwrap();
-    let connecting = || SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
+    let connecting = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
     let trainer = service::start(service::Config {
         dataset: folder.path().join("data"),
         checkpoints: folder.path().join("checkpoints"),
@@ -54,7 +54,7 @@ async fn swap(swaps: u32, endpoint: &str) {
         name: PLANNER.into(),
         models_dir: folder.path().join("none"),
         grpc_listen: "127.0.0.1:0".parse().unwrap(),
-        session: connecting(),
+        session: connecting.clone(),
         ..planner::Config::default()
     });
     let planner = planner.await.unwrap();
@@ -68,7 +68,7 @@ async fn swap(swaps: u32, endpoint: &str) {
         tokio::time::timeout(PATIENCE, poll).await.unwrap_or_else(|_| panic!("version {version} is not served"));
     };
 
-    let session = service_kit::session::open(&connecting()).await.unwrap();
+    let session = joined(&connecting).await;
     let mut expected = Expected::new();
     for version in 1..=2 {
         let path = folder.path().join(format!("checkpoints/{MODEL}.safetensors"));
@@ -82,7 +82,7 @@ async fn swap(swaps: u32, endpoint: &str) {
     let (expected, done) = (Arc::new(expected), Arc::new(AtomicBool::new(false)));
     let mut clients = JoinSet::new();
     for client in 0..4 {
-        let session = service_kit::session::open(&connecting()).await.unwrap();
+        let session = joined(&connecting).await;
         let (expected, done) = (Arc::clone(&expected), Arc::clone(&done));
         clients.spawn(async move {
             let mut answers = Answers::default();
@@ -112,6 +112,15 @@ async fn swap(swaps: u32, endpoint: &str) {
     session.close().await.unwrap();
     planner.shutdown().await.unwrap();
     trainer.shutdown().await.unwrap();
+}
+
+/// A session that knows the planner.
+async fn joined(config: &SessionConfig) -> Session {
+    let session = service_kit::session::open(config).await.unwrap();
+    let token = key::planner_alive(PLANNER).unwrap();
+    let alive = session.liveliness().declare_subscriber(token).history(true).await.unwrap();
+    tokio::time::timeout(PATIENCE, alive.recv_async()).await.expect("a planner").unwrap();
+    session
 }
 
 #[derive(Debug, Default)]

@@ -255,7 +255,7 @@ fn damaged_versions_give_way() {
 
     std::fs::write(folder.path().join("versions/cpn/history.json"), b"{").unwrap();
     let error = format!("{:#}", Versions::open(folder.path().to_owned(), NonZeroU16::MIN).unwrap_err());
-    assert!(error.contains("versions/cpn/history.json: EOF"), "{error}");
+    assert!(error.contains("versions/cpn: history.json: EOF"), "{error}");
 }
 
 #[test]
