@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
-use tracing::{info, warn};
+use tracing::{debug, warn};
 use wire::checkpoint::{
     CheckpointManifest, CheckpointVersion, ListVersionsRequest, ListVersionsResponse, PromoteVersionRequest,
     PromoteVersionResponse, RollBackRequest, RollBackResponse,
@@ -85,7 +85,7 @@ async fn announce(
         let announcements: Vec<_> = promoted.borrow_and_update().values().cloned().collect();
         for announcement in announcements {
             let CheckpointManifest { model, version, digest, .. } = &announcement.manifest;
-            info!(model, version, digest, "announced");
+            debug!(model, version, digest, "announced");
             let key = key::checkpoint_announcement(model)?;
             session.put(key, encode(announcement)).await.map_err(|e| anyhow!(e))?;
         }

@@ -251,6 +251,15 @@ fn damaged_versions_give_way() {
     let versions = open(&folder, 5);
     assert_eq!(listed(&versions), (vec![2], 2));
     assert!(announced(&versions).promoted_unix_nanos > before.promoted_unix_nanos, "planners must go back");
+    versions.publish("cpn", &checkpoint(4)).unwrap();
+    assert_eq!(roll_back(&versions).unwrap(), 2);
+    drop(versions);
+
+    // Of what was ever promoted and not rolled back nothing is left.
+    std::fs::remove_file(path(2)).unwrap();
+    let versions = open(&folder, 5);
+    assert_eq!(listed(&versions), (vec![3], 3));
+    assert_eq!(fetched(&versions, &announced(&versions).manifest), checkpoint(4));
     drop(versions);
 
     std::fs::write(folder.path().join("versions/cpn/history.json"), b"{").unwrap();
