@@ -3,7 +3,7 @@
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use cpn::checkpoint::{self, Provenance};
-use cpn::config::ConvConfig;
+use cpn::config::{ConvConfig, ImageEncoderConfig};
 use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, images};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -75,14 +75,14 @@ pub fn keep(folder: &Path, episode: &Episode) {
 
 /// A checkpoint of few, random weights.
 pub fn checkpoint(seed: u64) -> Vec<u8> {
-    let encoder = EncoderConfig {
+    let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
             ConvConfig { channels: 3, kernel: 8, stride: 8 },
             ConvConfig { channels: 4, kernel: 4, stride: 3 },
         ],
         latent: 6,
         layer_norm: true,
-    };
+    });
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(MethodKind::Cpn) };
     let provenance = Provenance {
         training_tasks: vec!["reach".into()],
