@@ -8,7 +8,7 @@ EXPORT := export/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset models export-lerobot test test-crash test-export bench-sim lint format clean
+.PHONY: help setup system build demo dataset models export-lerobot test test-crash test-swap test-export bench-sim lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -54,6 +54,9 @@ test: setup ## Everything that must pass
 
 test-crash: setup ## Kill the recorder a hundred times
 	cargo test --workspace --locked --test crash -- --ignored
+
+test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
+	cargo test --workspace --locked --test swap -- --ignored --nocapture
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest

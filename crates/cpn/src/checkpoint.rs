@@ -47,6 +47,15 @@ pub struct Checkpoint {
     pub provenance: Provenance,
     /// SHA-256 of the checkpoint's bytes, in hex.
     pub digest: String,
+    /// SHA-256 of the configuration's JSON, as it stands in the metadata, in hex.
+    pub config_digest: String,
+}
+
+impl Checkpoint {
+    /// Digests of what the model was made from: that of the demonstrations, if it is known.
+    pub fn parents(&self) -> Vec<String> {
+        Some(self.provenance.data_digest.clone()).filter(|digest| !digest.is_empty()).into_iter().collect()
+    }
 }
 
 /// Serialises an agent; the same weights give the same bytes.
@@ -74,10 +83,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     }
     let metadata: Metadata = serde_json::from_value(document).map_err(CheckpointError::Metadata)?;
     metadata.model.validate()?;
+    let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
     let mut agent = Agent::new(metadata.model, 0);
     copy_weights(&tensors, &agent)?;
     agent.variables_mut().freeze();
-    Ok(Checkpoint { agent, provenance: metadata.provenance, digest: digest(bytes) })
+    let (digest, config_digest) = (digest(bytes), digest(&config));
+    Ok(Checkpoint { agent, provenance: metadata.provenance, digest, config_digest })
 }
 
 /// SHA-256 of bytes, in hex: how checkpoints are named.

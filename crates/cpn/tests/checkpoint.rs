@@ -46,7 +46,22 @@ fn a_checkpoint_comes_back_whole() {
         assert_eq!(loaded.agent.plan(&x, &x, 0).actions, agent.plan(&x, &x, 0).actions);
         assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
+        assert_eq!(loaded.parents(), ["d"]);
     }
+}
+
+#[test]
+fn the_configuration_has_a_digest_of_its_own() {
+    let config = |agent: &Agent| {
+        checkpoint::from_bytes(&checkpoint::to_bytes(agent, &provenance()).unwrap()).unwrap().config_digest
+    };
+    let (_, metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
+    let agent = Agent::new(small_config(MethodKind::Cpn), 5);
+    let json = serde_json::to_string(agent.config()).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&json).unwrap(), metadata["model"]);
+    assert_eq!(config(&agent), checkpoint::digest(json.as_bytes()));
+    assert_eq!(config(&agent), config(&Agent::new(small_config(MethodKind::Cpn), 6)), "whatever the weights");
+    assert_ne!(config(&agent), config(&Agent::new(small_config(MethodKind::Upn), 5)));
 }
 
 #[test]

@@ -28,11 +28,14 @@ fn keys_are_the_ones_agreed_upon() {
             "planner_alive" => key::planner_alive(&chunk("planner")),
             "checkpoint_announcement" => key::checkpoint_announcement(&chunk("model")),
             "checkpoint_chunk" => key::checkpoint_chunk(&chunk("digest")),
+            "checkpoint_list_versions" => key::checkpoint_list_versions(&chunk("model")),
+            "checkpoint_promote" => key::checkpoint_promote(&chunk("model")),
+            "checkpoint_roll_back" => key::checkpoint_roll_back(&chunk("model")),
             other => panic!("keys.json names {other}, which is not tested here"),
         };
         assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
     }
-    assert_eq!(golden.len(), 15, "every key is in the file");
+    assert_eq!(golden.len(), 18, "every key is in the file");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use prost::Message as _;
+use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::sim::StepRequest;
@@ -36,7 +37,7 @@ fn the_unspoiled_request_is_fine() {
 
 #[test]
 fn each_wrong_field_is_named() {
-    let cases: [(Error, &str, &str, &str); 9] = [
+    let cases: [(Error, &str, &str, &str); 10] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -44,6 +45,12 @@ fn each_wrong_field_is_named() {
             "goal_id",
             "64 lower-case hexadecimal digits",
             "\"zz\"",
+        ),
+        (
+            refusal(|r| r.model_digest = "5F".repeat(32)),
+            "model_digest",
+            "64 lower-case hexadecimal digits",
+            &format!("{:?}", "5F".repeat(32)),
         ),
         (refusal(|r| r.observation = None), "observation", "a value", "none"),
         (
@@ -147,6 +154,40 @@ fn each_wrong_field_of_a_step_is_named() {
         let mut step = good();
         spoil(&mut step);
         let error = decode::<DemonstrationStep>(&step.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_an_announcement_is_named() {
+    let digest = || "0".repeat(64);
+    let good = || proto::CheckpointManifest {
+        model: "cpn".into(),
+        version: 1,
+        digest: digest(),
+        size_bytes: 1,
+        config_digest: digest(),
+        parents: vec![digest()],
+    };
+    let decode = |manifest| {
+        let announcement = proto::CheckpointAnnouncement { manifest, promoted_unix_nanos: 1 };
+        decode::<CheckpointAnnouncement>(&announcement.encode_to_vec())
+    };
+    decode(Some(good())).unwrap();
+    assert_eq!(decode(None).unwrap_err().field, "manifest");
+    type Spoil = fn(&mut proto::CheckpointManifest);
+    let cases: [(Spoil, &str, &str); 6] = [
+        (|m| m.model = "../x".into(), "manifest.model", "\"../x\""),
+        (|m| m.version = 0, "manifest.version", "0"),
+        (|m| m.digest = "zz".into(), "manifest.digest", "\"zz\""),
+        (|m| m.config_digest = String::new(), "manifest.config_digest", "\"\""),
+        (|m| m.parents = vec!["zz".into()], "manifest.parents", "\"zz\""),
+        (|m| m.parents = vec!["0".repeat(64); 65], "manifest.parents", "65"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut manifest = good();
+        spoil(&mut manifest);
+        let error = decode(Some(manifest)).unwrap_err();
         assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
     }
 }

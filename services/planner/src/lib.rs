@@ -6,10 +6,12 @@
 
 pub mod config;
 pub mod core;
+mod follow;
 mod goals;
 mod grpc;
 pub mod model;
 mod model_thread;
+mod served;
 mod zenoh;
 
 use crate::core::PlannerCore;

@@ -3,6 +3,7 @@
 use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 use service_kit::SessionConfig;
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 
 /// Take in demonstrations, train the learned methods, publish checkpoints.
@@ -27,6 +28,12 @@ pub enum Command {
     Mirror(MirrorArgs),
     /// Read every recording and report what is in them and what is wrong.
     Verify(VerifyArgs),
+    /// List the published versions that a trainer keeps.
+    Versions(VersionsArgs),
+    /// Let planners serve a version that is kept.
+    Promote(PromoteArgs),
+    /// Let planners serve the version that was promoted before.
+    Rollback(RollbackArgs),
 }
 
 /// What was typed; what was not is left to the environment, the file and the defaults.
@@ -44,6 +51,10 @@ pub struct ServeArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     checkpoints: Option<PathBuf>,
+    /// Versions of a model that are kept.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    keep_versions: Option<NonZeroU16>,
     #[command(flatten)]
     session: SessionConfig,
 }
@@ -134,4 +145,36 @@ pub struct VerifyArgs {
     /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct VersionsArgs {
+    /// The model whose versions to list; all if none is given.
+    pub model: Option<String>,
+    /// Print JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct PromoteArgs {
+    /// Name of the model.
+    pub model: String,
+    /// The version to serve.
+    pub version: u32,
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct RollbackArgs {
+    /// Name of the model.
+    pub model: String,
+    #[command(flatten)]
+    pub session: SessionConfig,
 }

@@ -1,16 +1,17 @@
 //! Takes in demonstration streams, trains the learned methods, publishes checkpoints.
 //!
 //! Two processes that meet in the file system, so that neither can take the other down: the service ([`service`]) keeps
-//! every committed episode ([`ingest`], [`recorder`]) and offers every finished checkpoint to the planners
+//! every committed episode ([`ingest`], [`recorder`]), keeps the [`versions`] of every model and offers them to the planners
 //! ([`publish`]); a training run ([`train`]) reads the episodes ([`dataset`]), tells how far it is ([`progress`]) and
-//! writes a checkpoint. Recordings
-//! ([`recordings`]) can be sent again ([`replay`]), copied from another recorder ([`mirror`]), and checked ([`verify`]).
+//! writes a checkpoint. Recordings ([`recordings`]) can be sent again ([`replay`]), copied from another recorder
+//! ([`mirror`]), and checked ([`verify`]).
 
 pub mod adam;
 pub mod augment;
 pub mod config;
 pub mod dataset;
 pub mod frame;
+mod history;
 pub mod ingest;
 pub mod learner;
 pub mod mirror;
@@ -23,3 +24,4 @@ pub mod sampler;
 pub mod service;
 pub mod train;
 pub mod verify;
+pub mod versions;

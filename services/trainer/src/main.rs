@@ -5,7 +5,9 @@ mod cli;
 
 use anyhow::{anyhow, ensure};
 use clap::Parser;
-use cli::{Cli, Command, MirrorArgs, PresetArgs, ReplayArgs, VerifyArgs};
+use cli::{
+    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, VerifyArgs, VersionsArgs,
+};
 use cpn::Preset;
 use serde::Deserialize;
 use serde::de::{IntoDeserializer, value};
@@ -16,7 +18,7 @@ use trainer::config::Config;
 use trainer::progress::{Bar, Observer, StopIf};
 use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
-use trainer::{mirror, replay, service, verify};
+use trainer::{mirror, publish, replay, service, verify};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
@@ -33,6 +35,9 @@ async fn main() -> anyhow::Result<()> {
         Command::Replay(arguments) => replay(arguments).await,
         Command::Mirror(arguments) => mirror(arguments).await,
         Command::Verify(arguments) => verify(&arguments),
+        Command::Versions(arguments) => versions(arguments).await,
+        Command::Promote(arguments) => promote(arguments).await,
+        Command::Rollback(arguments) => rollback(arguments).await,
     }
 }
 
@@ -102,4 +107,29 @@ fn verify(VerifyArgs { dataset, tasks, episodes, json }: &VerifyArgs) -> anyhow:
     }
     ensure!(report.faults.is_empty(), "{}: {} faults", dataset.display(), report.faults.len());
     Ok(())
+}
+
+async fn versions(VersionsArgs { model, json, session }: VersionsArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let versions = publish::list(&session, model).await?;
+    if json {
+        println!("{}", serde_json::to_string_pretty(&versions)?);
+    } else {
+        println!("{}", publish::table(&versions));
+    }
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+async fn promote(PromoteArgs { model, version, session }: PromoteArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let promoted = publish::promote(&session, model, version).await?;
+    println!("{} {} is promoted", promoted.model, promoted.version);
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+async fn rollback(RollbackArgs { model, session }: RollbackArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let promoted = publish::roll_back(&session, model).await?;
+    println!("{} {} is promoted", promoted.model, promoted.version);
+    session.close().await.map_err(|e| anyhow!(e))
 }

@@ -12,14 +12,11 @@ use tracing::warn;
 use wire::demonstration::RecordedEpisode;
 use wire::{Code, Error};
 
-/// Name of the file in a folder that the process that keeps it has locked.
-const LOCK: &str = ".lock";
-
 /// The recordings that one process keeps, known by their headers.
 #[derive(Debug)]
 pub struct Recordings {
     folder: PathBuf,
-    /// Held as long as this lives: two processes would each know a part.
+    /// Held as long as this lives.
     _lock: File,
     index: Mutex<Index>,
     /// Held from the check to the entry: two episodes of one id are never written both.
@@ -40,9 +37,7 @@ impl Recordings {
     /// # Errors
     /// If the folder cannot be made or read, another process has it, or its recordings differ in their render spec.
     pub fn open(folder: PathBuf) -> anyhow::Result<Self> {
-        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-        let lock = File::create(folder.join(LOCK)).with_context(|| folder.display().to_string())?;
-        lock.try_lock().with_context(|| format!("{}: expected a folder that no process keeps", folder.display()))?;
+        let lock = files::take_over(&folder)?;
         for task in tasks(&folder)? {
             files::remove_unfinished(&folder.join(task))?;
         }

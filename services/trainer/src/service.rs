@@ -4,9 +4,11 @@ use crate::ingest::{Ingest, Limits};
 use crate::publish;
 use crate::recorder::{self, Recorder};
 use crate::recordings::Recordings;
+use crate::versions::Versions;
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
 use service_kit::SessionConfig;
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::sync::Arc;
 use tokio::task::JoinSet;
@@ -19,6 +21,8 @@ pub struct Config {
     pub dataset: PathBuf,
     /// Whose checkpoints are published.
     pub checkpoints: PathBuf,
+    /// Versions of a model that are kept.
+    pub keep_versions: NonZeroU16,
     /// How to join the others.
     pub session: SessionConfig,
 }
@@ -28,6 +32,7 @@ impl Default for Config {
         Self {
             dataset: "data/demonstrations".into(),
             checkpoints: "runs/checkpoints".into(),
+            keep_versions: const { NonZeroU16::new(5).expect("not zero") },
             session: SessionConfig::default(),
         }
     }
@@ -44,16 +49,15 @@ pub struct Service {
 /// Starts the service; when this returns, it answers.
 ///
 /// # Errors
-/// If the dataset is mixed or cannot be read, or the session cannot be opened.
+/// If the dataset is mixed or cannot be read, the published versions cannot be read, or the session cannot be opened.
 pub async fn start(config: Config) -> anyhow::Result<Service> {
-    let folder = config.dataset.clone();
-    let recordings = Arc::new(tokio::task::spawn_blocking(move || Recordings::open(folder)).await??);
+    let Config { dataset, checkpoints, keep_versions, .. } = config;
+    let recordings = Arc::new(tokio::task::spawn_blocking(move || Recordings::open(dataset)).await??);
+    let versions = Arc::new(tokio::task::spawn_blocking(move || Versions::open(checkpoints, keep_versions)).await??);
     let session = service_kit::session::open(&config.session).await?;
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
     let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
-    let mut tasks = JoinSet::new();
-    let publisher = session.clone();
-    tasks.spawn(async move { publish::serve(&publisher, config.checkpoints).await });
+    let tasks = publish::start(&session, &versions).await?;
     Ok(Service { session, recorder, tasks })
 }
 

@@ -80,3 +80,18 @@ def checkpoint_announcement(model: str) -> str:
 def checkpoint_chunk(digest: str) -> str:
     """Queryable of the trainer: `CheckpointChunkRequest` to `CheckpointChunkResponse`."""
     return f"{ROOT}/checkpoint/{digest}/chunk"
+
+
+def checkpoint_list_versions(model: str) -> str:
+    """Queryable of the trainer: `ListVersionsRequest` to `ListVersionsResponse`."""
+    return f"{ROOT}/checkpoint/{model}/list_versions"
+
+
+def checkpoint_promote(model: str) -> str:
+    """Queryable of the trainer: `PromoteVersionRequest` to `PromoteVersionResponse`."""
+    return f"{ROOT}/checkpoint/{model}/promote"
+
+
+def checkpoint_roll_back(model: str) -> str:
+    """Queryable of the trainer: `RollBackRequest` to `RollBackResponse`."""
+    return f"{ROOT}/checkpoint/{model}/roll_back"

@@ -186,6 +186,7 @@ pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
         observation: Some(image(seed)),
         seed,
         deadline_ms: 0,
+        model_digest: String::new(),
     }
 }
 
@@ -223,7 +224,7 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
     let provenance =
-        Provenance { training_tasks, data_digest: "d".into(), render_spec: render_spec.into(), seed, epochs: 1 };
+        Provenance { training_tasks, data_digest: "d".repeat(64), render_spec: render_spec.into(), seed, epochs: 1 };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
 
@@ -317,6 +318,7 @@ pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
         digest: checkpoint::digest(name.as_bytes()),
         training_tasks: Vec::new(),
         horizon: 1,
+        version: 0,
     };
     core.serve(Model { info, render_spec: String::new(), method }).await.unwrap();
 }
