@@ -92,9 +92,7 @@ class Batches:
                 raise ValueError(f"method of {path}: expected {method}, got {model.method}")
             return cls(
                 model=model,
-                weights={
-                    name.removeprefix(WEIGHT): file.get_tensor(name) for name in names if name.startswith(WEIGHT)
-                },
+                weights={name.removeprefix(WEIGHT): file.get_tensor(name) for name in names if name.startswith(WEIGHT)},
                 frames=file.get_tensor("frames"),
                 observation_index=file.get_tensor("observation_index"),
                 goal_index=file.get_tensor("goal_index"),
