@@ -1,10 +1,11 @@
 """The methods in JAX: a whole training step, its gather included, as one compiled function with donated weights.
 
-Tried for CPN at the paper's sizes, batch 128, one thread (samples per second of CPU time, medians of 4 interleaved turns
-on a busy machine): batched arrays with unrolled steps 330, which is what stands here; the gated product as a sum instead
-of an einsum 321; a `vmap` over plans 239; `lax.scan` over the steps, with the sum, 151. Most of the time goes into the
-convolutions: forward and backward of 256 pictures take 0.36 s of CPU time with channels last, 0.35 to 0.37 with channels
-first and with XLA's flags `ynn_fusion_type`, `use_onednn` and `fast_math`, 0.42 as matrix products of patches.
+Tried for CPN at the paper's sizes, batch 128, one thread (samples per second of CPU time, medians of 4 interleaved
+turns on a busy machine): batched arrays with unrolled steps 330, which is what stands here; the gated product as a sum
+instead of an einsum 321; a `vmap` over plans 239; `lax.scan` over the steps, with the sum, 151. Most of the time goes
+into the convolutions: forward and backward of 256 pictures take 0.36 s of CPU time with channels last, 0.35 to 0.37
+with channels first and with XLA's flags `ynn_fusion_type`, `use_onednn` and `fast_math`, 0.42 as matrix products of
+patches.
 """
 
 import os

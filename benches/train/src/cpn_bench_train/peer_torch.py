@@ -1,10 +1,10 @@
 """The methods in PyTorch, eager or compiled, written as its documentation would have them.
 
-Tried for CPN at the paper's sizes, batch 128, one thread (per second of CPU time, medians of 6 to 8 interleaved turns on a
-busy machine). With glibc told to keep freed memory, the gated product as `baddbmm` gives 628 samples/s; as a weighted sum
-1.21 times that; with channels last too 1.25 times, which is what stands here. With glibc as it comes `matmul`, `einsum`,
-`baddbmm` and the sum lie within 11 %; to `matmul` the memory setting gave 9 %, huge pages 2 %, and the `foreach` Adam
-instead of the fused one 5 %, which was about the noise.
+Tried for CPN at the paper's sizes, batch 128, one thread (per second of CPU time, medians of 6 to 8 interleaved turns
+on a busy machine). With glibc told to keep freed memory, the gated product as `baddbmm` gives 628 samples/s; as a
+weighted sum 1.21 times that; with channels last too 1.25 times, which is what stands here. With glibc as it comes
+`matmul`, `einsum`, `baddbmm` and the sum lie within 11 %; to `matmul` the memory setting gave 9 %, huge pages 2 %, and
+the `foreach` Adam instead of the fused one 5 %, which was about the noise.
 
 `torch.compile` cannot differentiate its graphs twice, but it traces through `torch.func.grad`: one graph (`fullgraph`)
 holds the forward pass and the inner gradient, and the outer gradient is derived from it. That gives 1.28 times;
