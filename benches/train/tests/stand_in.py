@@ -43,7 +43,12 @@ def write(path: Path) -> None:
         "actions": noise(BATCHES, BATCH, 1, ACTIONS),
         "mask": np.ones((BATCHES, BATCH, 1), np.float32),
     }
-    encoder = {"convolutions": [{"channels": 4, "kernel": 8, "stride": 8}], "latent": LATENT, "layer_norm": True}
+    encoder = {
+        "kind": "image",
+        "convolutions": [{"channels": 4, "kernel": 8, "stride": 8}],
+        "latent": LATENT,
+        "layer_norm": True,
+    }
     model = {"method": "bc", "encoder": encoder, "hidden": HIDDEN, "gate_hidden": 1, "actions": ACTIONS}
     model |= {"horizon": 1, "updates": 0}
     save_file(tensors, path, metadata={"cpn": json.dumps(model)})
