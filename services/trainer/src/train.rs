@@ -14,9 +14,6 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// How often a run saves its state.
-const SAVE_INTERVAL: Duration = Duration::from_secs(60);
-
 /// Settings of a run; the defaults are those of the shipped checkpoints.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -43,6 +40,10 @@ pub struct Config {
     pub seed: u64,
     /// Threads of libtorch; 0 leaves it to libtorch.
     pub threads: i32,
+    /// How often the run saves its state; 0 is after each step.
+    pub save_interval_seconds: f64,
+    /// Where the run keeps its progress, events and curve; `runs/training/` and the stem of `out` if none is given.
+    pub run_dir: Option<PathBuf>,
 }
 
 impl Default for Config {
@@ -59,12 +60,27 @@ impl Default for Config {
             max_gradient_norm: 10.0,
             seed: 0,
             threads: 0,
+            save_interval_seconds: 60.0,
+            run_dir: None,
         }
     }
 }
 
+impl Config {
+    /// The run's name: the stem of its checkpoint's file.
+    pub fn name(&self) -> String {
+        self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// Where the run keeps its progress, events and curve.
+    pub fn run_dir(&self) -> PathBuf {
+        self.run_dir.clone().unwrap_or_else(|| Path::new("runs/training").join(self.name()))
+    }
+}
+
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The checkpoint of this digest is written.
     Finished {
@@ -96,6 +112,7 @@ struct ResumePoint {
 /// cannot be written, or the observer fails.
 pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outcome> {
     ensure!(config.batch_size > 0 && config.epochs > 0, "batch_size and epochs: expected at least 1, got 0");
+    let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
     if config.threads > 0 {
         tch::set_num_threads(config.threads);
     }
@@ -138,7 +155,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
             let norm = adam.step(learning_rate, config.max_gradient_norm);
             step += 1;
             observer.observe(&meter.step(step, samples.len(), value, learning_rate, norm))?;
-            if saved.elapsed() > SAVE_INTERVAL {
+            if saved.elapsed() >= save_interval {
                 save(&resume_path, config, &dataset, &adam, step, &meter)?;
                 saved = Instant::now();
             }

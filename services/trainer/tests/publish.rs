@@ -57,7 +57,10 @@ async fn checkpoints_reach_every_planner() {
     let trainer = service::start(service::Config {
         dataset: folder.path().join("data"),
         checkpoints: checkpoints.clone(),
+        runs: folder.path().join("runs"),
+        grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() },
+        ..service::Config::default()
     })
     .await
     .unwrap();
