@@ -58,6 +58,14 @@ keys! {
     checkpoint_promote(model) = "cpn/@v1/checkpoint/${model:*}/promote";
     /// Queryable: [`crate::checkpoint::RollBackRequest`].
     checkpoint_roll_back(model) = "cpn/@v1/checkpoint/${model:*}/roll_back";
+    /// Queryable: [`crate::training::StartRunRequest`].
+    trainer_start_run(trainer) = "cpn/@v1/trainer/${trainer:*}/start_run";
+    /// Queryable: [`crate::training::StopRunRequest`].
+    trainer_stop_run(trainer) = "cpn/@v1/trainer/${trainer:*}/stop_run";
+    /// Queryable: [`crate::training::ListRunsRequest`].
+    trainer_list_runs(trainer) = "cpn/@v1/trainer/${trainer:*}/list_runs";
+    /// Published [`crate::training::Run`].
+    training_progress(run) = "cpn/@v1/training/${run:*}/progress";
     /// Liveliness token of a planner.
     planner_alive(planner) = "cpn/@v1/alive/planner/${planner:*}";
     /// Liveliness token of a simulator worker.

@@ -7,6 +7,7 @@ use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::sim::StepRequest;
+use wire::training::{Run, StartRunRequest};
 use wire::{Code, Error, decode, proto};
 
 fn black(side: u32) -> proto::Image {
@@ -188,6 +189,57 @@ fn each_wrong_field_of_an_announcement_is_named() {
         let mut manifest = good();
         spoil(&mut manifest);
         let error = decode(Some(manifest)).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_a_run_is_named() {
+    let good = || proto::Run {
+        name: "cpn".into(),
+        state: proto::RunState::Finished.into(),
+        progress: Some(proto::TrainingProgress { step: 3, steps: 9, ..Default::default() }),
+        digest: "0".repeat(64),
+        reason: String::new(),
+    };
+    decode::<Run>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::Run);
+    let cases: [(Spoil, &str, &str); 6] = [
+        (|r| r.name = "a/b".into(), "name", "\"a/b\""),
+        (|r| r.state = 0, "state", "RUN_STATE_UNSPECIFIED"),
+        (|r| r.digest = "ABC".into(), "digest", "\"ABC\""),
+        (|r| (r.state, r.reason) = (proto::RunState::Failed.into(), "x".repeat(2001)), "reason", "2001 bytes"),
+        (|r| r.progress = Some(proto::TrainingProgress::default()), "progress.steps", "0"),
+        (
+            |r| r.progress = Some(proto::TrainingProgress { steps: 1, loss: f64::NAN, ..Default::default() }),
+            "progress.loss",
+            "NaN",
+        ),
+    ];
+    for (spoil, field, got) in cases {
+        let mut run = good();
+        spoil(&mut run);
+        let error = decode::<Run>(&run.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_a_start_is_named() {
+    let good = || proto::StartRunRequest { name: "cpn".into(), ..Default::default() };
+    decode::<StartRunRequest>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::StartRunRequest);
+    let cases: [(Spoil, &str, &str); 5] = [
+        (|r| r.name = String::new(), "name", "\"\""),
+        (|r| r.preset = "A".into(), "preset", "\"A\""),
+        (|r| r.hold_out = vec!["reach".into(), "../reach".into()], "hold_out", "\"../reach\""),
+        (|r| r.hold_out = vec!["reach".into(); 1001], "hold_out", "1001"),
+        (|r| r.settings = "#".repeat((16 << 10) + 1), "settings", "16385 bytes"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut request = good();
+        spoil(&mut request);
+        let error = decode::<StartRunRequest>(&request.encode_to_vec()).unwrap_err();
         assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
     }
 }

@@ -10,6 +10,7 @@ use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
 use wire::sim::*;
+use wire::training::*;
 use wire::{Image, Message, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
@@ -77,6 +78,26 @@ fn manifest() -> impl Strategy<Value = CheckpointManifest> {
 
 fn variation() -> impl Strategy<Value = Variation> {
     (name(), any::<u64>()).prop_map(|(task, seed)| Variation { task, seed })
+}
+
+fn progress() -> impl Strategy<Value = Progress> {
+    ((any::<u64>(), 1u64.., any::<u64>(), any::<u64>(), any::<u64>()), (-9.0..9.0, 0.0..1.0, 0.0..9.0, 0.0..1e6))
+        .prop_map(
+            |((step, steps, epoch, epochs, samples), (loss, learning_rate, gradient_norm, samples_per_second))| {
+                Progress { step, steps, epoch, epochs, samples, loss, learning_rate, gradient_norm, samples_per_second }
+            },
+        )
+}
+
+fn run() -> impl Strategy<Value = Run> {
+    let state = prop_oneof![
+        Just(RunState::Running),
+        digest().prop_map(|digest| RunState::Finished { digest }),
+        Just(RunState::Stopped),
+        "\\PC{0,40}".prop_map(|reason| RunState::Failed { reason }),
+        Just(RunState::Interrupted),
+    ];
+    (name(), state, option::of(progress())).prop_map(|(name, state, progress)| Run { name, state, progress })
 }
 
 fn survives<M: Message + Clone + PartialEq + std::fmt::Debug>(message: M) {
@@ -192,6 +213,27 @@ proptest! {
     }
 
     #[test]
+    fn training(
+        name in name(),
+        preset in option::of(name()),
+        hold_out in vec(name(), 0..3),
+        seed in option::of(any::<u64>()),
+        settings in "\\PC{0,40}",
+        run in run(),
+        runs in vec(run(), 0..3),
+    ) {
+        survives(run.clone());
+        survives(StartRunRequest { name: name.clone(), preset, hold_out, seed, settings });
+        survives(StartRunResponse { run: run.clone() });
+        survives(StopRunRequest { name: name.clone() });
+        survives(StopRunResponse { run: run.clone() });
+        survives(ListRunsRequest);
+        survives(ListRunsResponse { runs });
+        survives(WatchRunRequest { name });
+        survives(WatchRunResponse { run });
+    }
+
+    #[test]
     fn any_bytes_are_refused_or_decoded(bytes in vec(any::<u8>(), 0..200)) {
         let _ = decode::<PlanRequest>(&bytes);
         let _ = decode::<LoadModelRequest>(&bytes);
@@ -201,5 +243,7 @@ proptest! {
         let _ = decode::<RecordedEpisode>(&bytes);
         let _ = decode::<CheckpointAnnouncement>(&bytes);
         let _ = decode::<ListVersionsResponse>(&bytes);
+        let _ = decode::<StartRunRequest>(&bytes);
+        let _ = decode::<Run>(&bytes);
     }
 }

@@ -31,8 +31,11 @@ pub struct Config {
     pub seed: u64,
     /// Threads that compute. The order of sums depends on their number, and with it the last bits of the weights.
     pub threads: usize,
-    /// How often the state is saved, in seconds.
-    pub save_interval_secs: u64,
+    /// How often the run saves its state; 0 is after each step.
+    pub save_interval_seconds: f64,
+    /// Where the run keeps its progress, events and curve; `runs/training/` and the stem of `out` if none is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub run_dir: Option<PathBuf>,
 }
 
 impl From<Preset> for Config {
@@ -47,7 +50,8 @@ impl From<Preset> for Config {
             hold_out: Vec::new(),
             seed: 0,
             threads: 1,
-            save_interval_secs: 60,
+            save_interval_seconds: 60.0,
+            run_dir: None,
         }
     }
 }
@@ -73,6 +77,16 @@ impl Config {
         let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(layers).extract()?;
         config.recipe().validate()?;
         Ok(config)
+    }
+
+    /// The run's name: the stem of its checkpoint's file.
+    pub fn name(&self) -> String {
+        self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// Where the run keeps its progress, events and curve.
+    pub fn run_dir(&self) -> PathBuf {
+        self.run_dir.clone().unwrap_or_else(|| Path::new("runs/training").join(self.name()))
     }
 
     /// What is trained, and how.

@@ -110,6 +110,8 @@ impl Ingest {
             return Err(Error::invalid("steps", format!("all steps below {count}"), extra));
         }
         self.recordings.keep(&Episode::new(request.episode.clone(), steps.into_values().collect())?)?;
+        metrics::counter!("cpn_recorder_episodes_total").increment(1);
+        metrics::counter!("cpn_recorder_steps_total").increment((*count).into());
         info!(episode = episode_id, steps = count, "kept");
         Ok(Commit::Kept)
     }

@@ -16,11 +16,12 @@ use std::f64::consts::PI;
 use std::path::PathBuf;
 use std::sync::mpsc;
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tracing::info;
 
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The checkpoint of this digest is written.
     Finished {
@@ -57,6 +58,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     recipe.validate()?;
     let Recipe { model, training } = &recipe;
     tch::set_num_threads(i32::try_from(config.threads).context("threads: expected a number of them")?);
+    let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
     let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
@@ -89,7 +91,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
             let learnt = learner.step(&batch, learning_rate).with_context(|| format!("step {step}"))?;
             let samples = batch.observations.size()[0] as usize;
             observer.observe(&meter.step(step + 1, samples, learnt.loss, learning_rate, learnt.gradient_norm))?;
-            if saved.elapsed().as_secs() >= config.save_interval_secs {
+            if saved.elapsed() >= save_interval {
                 state.save(step + 1, &learner.optimiser, &meter)?;
                 saved = Instant::now();
             }

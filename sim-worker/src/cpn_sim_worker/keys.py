@@ -67,6 +67,26 @@ def planner_list_models(planner: str) -> str:
     return f"{ROOT}/planner/{planner}/list_models"
 
 
+def trainer_start_run(trainer: str) -> str:
+    """Queryable: `StartRunRequest` to `StartRunResponse`."""
+    return f"{ROOT}/trainer/{trainer}/start_run"
+
+
+def trainer_stop_run(trainer: str) -> str:
+    """Queryable: `StopRunRequest` to `StopRunResponse`."""
+    return f"{ROOT}/trainer/{trainer}/stop_run"
+
+
+def trainer_list_runs(trainer: str) -> str:
+    """Queryable: `ListRunsRequest` to `ListRunsResponse`."""
+    return f"{ROOT}/trainer/{trainer}/list_runs"
+
+
+def training_progress(run: str) -> str:
+    """Put of the trainer: `Run`."""
+    return f"{ROOT}/training/{run}/progress"
+
+
 def planner_alive(planner: str) -> str:
     """Liveliness token of a planner that is ready."""
     return f"{ROOT}/alive/planner/{planner}"
