@@ -16,7 +16,7 @@ fn provenance() -> Provenance {
         data_digest: "d".into(),
         render_spec: r#"{"camera":"corner"}"#.into(),
         seed: 5,
-        epochs: 2,
+        training: cpn::Training::paper(),
     }
 }
 
@@ -85,10 +85,10 @@ fn an_oversized_file_is_refused() {
 
 #[test]
 fn another_format_is_refused() {
-    assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 2, got 1");
+    assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 3, got 1");
     // An older one lacks fields: that it is older is what counts.
-    assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 2, got 1");
-    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 2, got null");
+    assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 3, got 1");
+    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 3, got null");
 }
 
 #[test]

@@ -219,7 +219,7 @@ async fn an_announced_checkpoint_is_fetched() {
         data_digest: "d".repeat(64),
         render_spec: String::new(),
         seed: 4,
-        epochs: 0,
+        training: cpn::Training::paper(),
     };
     let bytes = cpn::checkpoint::to_bytes(&large, &provenance).unwrap();
     assert!(bytes.len() > 2 * wire::checkpoint::MAX_CHUNK_BYTES as usize);

@@ -58,7 +58,7 @@ impl From<Preset> for Config {
 
 impl Config {
     /// Reads settings in layers: `changes`, each `key=value`, over what was typed over the environment over a file over the
-    /// preset, which any of them but the changes may name.
+    /// preset, which any of them may name.
     ///
     /// # Errors
     /// Names the field, what was expected and what came.
@@ -68,13 +68,26 @@ impl Config {
             layers = layers.merge(Toml::file_exact(file));
         }
         layers = layers.merge(Env::prefixed(PREFIX).split("__")).merge(Serialized::defaults(arguments));
-        let preset = if layers.contains("preset") { layers.extract_inner("preset")? } else { Preset::Cpn };
         for change in changes {
             let (key, value) = change.split_once('=').with_context(|| format!("expected key=value, got {change:?}"))?;
             let value: Value = value.parse().with_context(|| change.clone())?;
             layers = layers.merge((key, value));
         }
-        let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(layers).extract()?;
+        Self::over_preset(layers)
+    }
+
+    /// Reads settings as they stand in a file.
+    ///
+    /// # Errors
+    /// Names the field, what was expected and what came.
+    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+        Self::over_preset(Figment::from(Toml::string(text)))
+    }
+
+    /// The settings of the preset that some settings name, and these over them.
+    fn over_preset(settings: Figment) -> anyhow::Result<Self> {
+        let preset = if settings.contains("preset") { settings.extract_inner("preset")? } else { Preset::Cpn };
+        let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(settings).extract()?;
         config.recipe().validate()?;
         Ok(config)
     }

@@ -5,7 +5,7 @@
 //! started again.
 
 use crate::run_process::{self, End};
-use crate::{journal, train};
+use crate::{config, journal};
 use futures::{Stream, stream};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
@@ -313,9 +313,8 @@ fn requested_settings(config: &Config, request: &StartRunRequest) -> Result<toml
             return Err(Error::invalid(format!("settings.{field}"), "a setting that is named once", twice));
         }
     }
-    settings_of_process(config, name, &table)
-        .try_into::<train::Config>()
-        .map_err(|error| Error::invalid("settings", "settings of a training run", error.message()))?;
+    config::Config::from_toml(&settings_of_process(config, name, &table).to_string())
+        .map_err(|error| Error::invalid("settings", "settings of a training run", format!("{error:#}")))?;
     Ok(table)
 }
 

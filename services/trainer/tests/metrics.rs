@@ -44,7 +44,7 @@ async fn recordings_and_runs_are_counted() {
     let session = service_kit::session::open(&connecting).await.unwrap();
     replay::send(&session, &episode("reach", 2, 7)).await.unwrap();
 
-    let settings = "method = \"bc\"\nbatch_size = 4\nepochs = 2\nthreads = 1".into();
+    let settings = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 2".into();
     let request = StartRunRequest { name: "short".into(), settings, ..StartRunRequest::default() };
     service.runs().start(&request).unwrap();
     let heard: Vec<_> = service.runs().watch("short").unwrap().collect().await;

@@ -24,6 +24,8 @@ async fn start_trainer(folder: &Path, endpoint: &str) -> Service {
     let config = service::Config {
         dataset: folder.join("data"),
         checkpoints: folder.join("checkpoints"),
+        runs: folder.join("runs"),
+        grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() },
         ..service::Config::default()
     };

@@ -40,8 +40,8 @@ impl Run {
     /// The real process; it saves its state after each step.
     fn start(&self, epochs: u64) -> Child {
         Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
-            .args(["train", "--json", "--method", "bc", "--batch-size", "2", "--seed", "4", "--threads", "1"])
-            .args(["--save-interval-seconds", "0", "--epochs", &epochs.to_string()])
+            .args(["train", "--json", "--preset", "paper-bc", "--set", "training.batch_size=2", "--seed", "4", "--threads", "1"])
+            .args(["--save-interval-seconds", "0", "--set", &format!("training.epochs={epochs}")])
             .arg("--dataset")
             .arg(&self.data)
             .arg("--out")

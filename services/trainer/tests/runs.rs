@@ -30,9 +30,9 @@ use zenoh::key_expr::OwnedKeyExpr;
 const PATIENCE: Duration = Duration::from_secs(120);
 const NAME: &str = "under-test";
 /// Settings of a run that is soon over.
-const SHORT: &str = "method = \"bc\"\nbatch_size = 4\nepochs = 2\nthreads = 1\n";
+const SHORT: &str = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 2\n";
 /// Settings of a run that is not over before it is stopped.
-const LONG: &str = "method = \"bc\"\nbatch_size = 4\nepochs = 100000\nthreads = 1\n";
+const LONG: &str = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 100000\n";
 
 /// A running service, with a second zenoh session and a gRPC channel to it.
 struct Fixture {
@@ -292,9 +292,9 @@ async fn every_transport_refuses_the_same() {
     let cases = [
         (request("Wrong", SHORT), "name"),
         (request("../wrong", SHORT), "name"),
-        (with("epochs ="), "settings"),
-        (with("epoch = 3"), "settings"),
-        (with("epochs = \"three\""), "settings"),
+        (with("training.epochs ="), "settings"),
+        (with("training.epoch = 3"), "settings"),
+        (with("training.epochs = \"three\""), "settings"),
         (with(&format!("# {}", "x".repeat(20_000))), "settings"),
         (with("out = \"/tmp/x\""), "settings.out"),
         (with("dataset = \"/tmp/x\""), "settings.dataset"),

@@ -46,6 +46,8 @@ async fn swap(swaps: u32, endpoint: &str) {
     let trainer = service::start(service::Config {
         dataset: folder.path().join("data"),
         checkpoints: folder.path().join("checkpoints"),
+        runs: folder.path().join("runs"),
+        grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() },
         ..service::Config::default()
     });

@@ -224,7 +224,7 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
     let provenance =
-        Provenance { training_tasks, data_digest: "d".repeat(64), render_spec: render_spec.into(), seed, epochs: 1 };
+        Provenance { training_tasks, data_digest: "d".repeat(64), render_spec: render_spec.into(), seed, training: cpn::Training::paper() };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
 

@@ -89,7 +89,7 @@ pub fn checkpoint(seed: u64) -> Vec<u8> {
         data_digest: DATA_DIGEST.into(),
         render_spec: String::new(),
         seed,
-        epochs: 1,
+        training: cpn::Training::paper(),
     };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
