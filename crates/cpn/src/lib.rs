@@ -34,5 +34,5 @@ pub mod planner;
 pub mod positions;
 
 pub use agent::{Agent, Method, Random};
-pub use config::{EncoderConfig, EncoderPreset, MethodKind, ModelConfig};
+pub use config::{EncoderConfig, EncoderPreset, Input, MethodKind, ModelConfig};
 pub use planner::Plan;

@@ -9,6 +9,7 @@ mod error;
 mod image;
 pub mod key;
 mod message;
+mod observation;
 pub mod planner;
 pub mod query;
 pub mod sim;
@@ -16,6 +17,7 @@ pub mod sim;
 pub use error::{Code, Error};
 pub use image::Image;
 pub use message::{Message, decode, encode};
+pub use observation::{Observation, Position};
 
 /// The generated protobuf types.
 #[allow(missing_docs, clippy::all, reason = "generated code")]

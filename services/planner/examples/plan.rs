@@ -21,7 +21,8 @@ async fn main() -> anyhow::Result<()> {
     let endpoint = arguments.next().unwrap_or_else(|| "tcp/127.0.0.1:7447".into());
 
     let session = service_kit::session::open(&SessionConfig { connect: vec![endpoint], ..Default::default() }).await?;
-    let request = PlanRequest { model: "cpn".into(), goal: Goal::Image(goal), observation, seed: 0, deadline: None };
+    let (model, goal, observation) = ("cpn".into(), Goal::Image(goal), observation.into());
+    let request = PlanRequest { model, goal, observation, seed: 0, deadline: None };
     let key = key::planner_plan("planner")?;
     let plan: PlanResponse = query::call(&session, &key, request, Duration::from_secs(10)).await?;
     println!("apply {:?} of {} planned actions", plan.first_action, plan.actions.len());
