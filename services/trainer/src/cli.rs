@@ -65,7 +65,23 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     method: Option<String>,
-    /// Encoder to train it with: paper or upn.
+    /// What observations and goals are: image or position.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    input: Option<String>,
+    /// Planned steps.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    horizon: Option<i64>,
+    /// Gradient updates of a plan.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    updates: Option<i64>,
+    /// Share of the goals that are told in hindsight, of positions.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hindsight: Option<f64>,
+    /// Encoder of images to train it with: paper or upn.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     encoder: Option<String>,

@@ -1,12 +1,12 @@
 //! The demonstrations of a training run, in memory.
 
 use crate::episode::Episode;
-use crate::recordings::{self, dataset_digest};
+use crate::recordings::{self, dataset_digest, tasks_of};
+use crate::train::Demonstrations;
 use anyhow::{Context, ensure};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use std::collections::BTreeSet;
 use std::path::Path;
 use tch::{Device, Kind, Tensor};
 use wire::demonstration::RecordedEpisode;
@@ -31,9 +31,9 @@ pub struct Sample {
 /// The tensors of a training step.
 #[derive(Debug)]
 pub struct Batch {
-    /// `[B, 84, 84, 3]` bytes.
+    /// `[B, 84, 84, 3]` bytes, or `[B, 3]` metres.
     pub observations: Tensor,
-    /// The last frames of the same episodes, `[B, 84, 84, 3]` bytes.
+    /// The last frames of the same episodes, or where they were to go; like the observations.
     pub goals: Tensor,
     /// The actions that follow, `[B, H, A]`; 0 past the end.
     pub actions: Tensor,
@@ -86,39 +86,36 @@ impl Dataset {
         self.infos.push(recording.info().clone());
         Ok(())
     }
+}
 
-    /// Names of the tasks, in order.
-    pub fn tasks(&self) -> BTreeSet<&str> {
-        self.infos.iter().map(|info| info.variation.task.as_str()).collect()
+impl Demonstrations for Dataset {
+    type Sample = Sample;
+
+    fn tasks(&self) -> Vec<String> {
+        tasks_of(&self.infos)
     }
 
-    /// How every frame was rendered; empty for those of a real camera.
-    pub fn render_spec(&self) -> &str {
+    fn render_spec(&self) -> &str {
         &self.render_spec
     }
 
-    /// Number of episodes.
-    pub fn episode_count(&self) -> usize {
+    fn episode_count(&self) -> usize {
         self.episodes.len()
     }
 
-    /// Number of frames with an action.
-    pub fn sample_count(&self) -> usize {
+    fn sample_count(&self) -> usize {
         self.samples.len()
     }
 
-    /// A, the size of an action.
-    pub fn action_size(&self) -> i64 {
+    fn action_size(&self) -> i64 {
         self.episodes[0].actions.size()[1]
     }
 
-    /// What [`dataset_digest`] gives for the episodes.
-    pub fn digest(&self) -> &str {
+    fn digest(&self) -> &str {
         &self.digest
     }
 
-    /// Every sample once, in an order that the seed and the epoch decide.
-    pub fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Sample> {
+    fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Sample> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(epoch);
         let mut samples = self.samples.clone();
@@ -126,8 +123,7 @@ impl Dataset {
         samples
     }
 
-    /// The tensors of some samples, with the next H actions of each.
-    pub fn batch(&self, samples: &[Sample], horizon: i64) -> Batch {
+    fn batch(&self, samples: &[Sample], horizon: i64) -> Batch {
         let options = (Kind::Float, Device::Cpu);
         let size = samples.len() as i64;
         let actions = Tensor::zeros([size, horizon, self.action_size()], options);

@@ -4,7 +4,7 @@ use anyhow::{Context, ensure};
 use recording::Episode;
 use service_kit::files;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -180,6 +180,12 @@ pub fn read(folder: &Path, path: &Path) -> anyhow::Result<Episode> {
 /// If the folder cannot be read.
 pub fn tasks(folder: &Path) -> anyhow::Result<Vec<String>> {
     names(folder, |path| path.is_dir())
+}
+
+/// The names of the tasks of some episodes, in order.
+pub fn tasks_of(episodes: &[RecordedEpisode]) -> Vec<String> {
+    let names: BTreeSet<_> = episodes.iter().map(|episode| &episode.variation.task).collect();
+    names.into_iter().cloned().collect()
 }
 
 /// The recordings of a folder, in order of task and name.

@@ -1,12 +1,13 @@
 //! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
 
 use crate::adam::Adam;
-use crate::dataset::Dataset;
+use crate::dataset::{Batch, Dataset};
+use crate::positions::Trajectories;
 use crate::progress::{Meter, Observer};
 use anyhow::{Context, ensure};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, EncoderPreset, MethodKind, ModelConfig};
+use cpn::{Agent, EncoderConfig, EncoderPreset, Input, MethodKind, ModelConfig};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::f64::consts::PI;
@@ -27,8 +28,16 @@ pub struct Config {
     pub out: PathBuf,
     /// Method to train.
     pub method: MethodKind,
-    /// Encoder to train it with.
+    /// What observations and goals are; positions are for tasks whose goal is one.
+    pub input: Input,
+    /// Encoder of images to train it with.
     pub encoder: EncoderPreset,
+    /// H; the paper's if none is given.
+    pub horizon: Option<i64>,
+    /// U; the paper's if none is given.
+    pub updates: Option<i64>,
+    /// Share of the samples whose goal is a position that the hand reached later, instead of the one it was given.
+    pub hindsight: f64,
     /// Tasks that the model must not see.
     pub hold_out: Vec<String>,
     /// Passes over every frame.
@@ -51,7 +60,11 @@ impl Default for Config {
             dataset: "data/demonstrations".into(),
             out: "runs/checkpoints/cpn.safetensors".into(),
             method: MethodKind::Cpn,
+            input: Input::Image,
             encoder: EncoderPreset::Paper,
+            horizon: None,
+            updates: None,
+            hindsight: 0.0,
             hold_out: Vec::new(),
             epochs: 5,
             batch_size: 128,
@@ -89,6 +102,28 @@ struct ResumePoint {
     loss: Option<f64>,
 }
 
+/// What a training run reads.
+pub trait Demonstrations {
+    /// A moment of an episode.
+    type Sample;
+    /// Names of the tasks, in order.
+    fn tasks(&self) -> Vec<String>;
+    /// Number of episodes.
+    fn episode_count(&self) -> usize;
+    /// Number of moments with an action.
+    fn sample_count(&self) -> usize;
+    /// A, the size of an action.
+    fn action_size(&self) -> i64;
+    /// What [`crate::recordings::dataset_digest`] gives for the episodes.
+    fn digest(&self) -> &str;
+    /// How every frame was rendered; empty for those of a real camera, and where none is looked at.
+    fn render_spec(&self) -> &str;
+    /// Every moment with an action once, in an order that the seed and the epoch decide.
+    fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Self::Sample>;
+    /// The tensors of some moments, with the next H actions of each.
+    fn batch(&self, samples: &[Self::Sample], horizon: i64) -> Batch;
+}
+
 /// Trains until the checkpoint is written or `observer` stops it; from a saved state if there is one.
 ///
 /// # Errors
@@ -99,20 +134,43 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     if config.threads > 0 {
         tch::set_num_threads(config.threads);
     }
-    let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
-    let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
+    match config.input {
+        Input::Image => {
+            ensure!(config.hindsight == 0.0, "hindsight: expected 0 for images, got {}", config.hindsight);
+            let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
+            run_on(config, &dataset, config.encoder.into(), observer)
+        }
+        Input::Position => {
+            ensure!(config.hold_out.is_empty(), "hold_out: expected none for positions, got {:?}", config.hold_out);
+            let trajectories = Trajectories::load(&config.dataset, config.hindsight)?;
+            let encoder = trajectories.encoder();
+            run_on(config, &trajectories, encoder, observer)
+        }
+    }
+}
+
+fn run_on(
+    config: &Config,
+    dataset: &impl Demonstrations,
+    encoder: EncoderConfig,
+    observer: &mut dyn Observer,
+) -> anyhow::Result<Outcome> {
+    let tasks = dataset.tasks();
     info!(tasks = tasks.len(), episodes = dataset.episode_count(), samples = dataset.sample_count(), "demonstrations");
 
+    let paper = ModelConfig::paper(config.method);
     let model = ModelConfig {
-        encoder: config.encoder.into(),
+        encoder,
         actions: dataset.action_size(),
-        ..ModelConfig::paper(config.method)
+        horizon: config.horizon.unwrap_or(paper.horizon),
+        updates: config.updates.unwrap_or(paper.updates),
+        ..paper
     };
     model.validate()?;
     let agent = Agent::new(model, config.seed);
     let mut adam = Adam::new(agent.variables());
     let resume_path = config.out.with_extension("resume");
-    let (mut step, loss) = resume(&resume_path, config, &dataset, &mut adam)?;
+    let (mut step, loss) = resume(&resume_path, config, dataset.digest(), &mut adam)?;
 
     let sample_count = dataset.sample_count() as u64;
     let per_epoch = sample_count.div_ceil(config.batch_size as u64);
@@ -126,7 +184,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
         let samples = dataset.shuffled(config.seed, epoch);
         for samples in samples.chunks(config.batch_size).skip((step % per_epoch) as usize) {
             if observer.should_stop(step) {
-                save(&resume_path, config, &dataset, &adam, step, &meter)?;
+                save(&resume_path, config, dataset.digest(), &adam, step, &meter)?;
                 return Ok(Outcome::Interrupted { step });
             }
             let batch = dataset.batch(samples, agent.config().horizon);
@@ -139,7 +197,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
             step += 1;
             observer.observe(&meter.step(step, samples.len(), value, learning_rate, norm))?;
             if saved.elapsed() > SAVE_INTERVAL {
-                save(&resume_path, config, &dataset, &adam, step, &meter)?;
+                save(&resume_path, config, dataset.digest(), &adam, step, &meter)?;
                 saved = Instant::now();
             }
         }
@@ -169,20 +227,19 @@ fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
     low + (peak - low) * 0.5 * (1.0 + (PI * progress).cos())
 }
 
-fn save(path: &Path, config: &Config, dataset: &Dataset, adam: &Adam, step: u64, meter: &Meter) -> anyhow::Result<()> {
-    let data_digest = dataset.digest().to_owned();
-    let point = ResumePoint { config: config.clone(), data_digest, step, loss: meter.loss };
+fn save(path: &Path, config: &Config, digest: &str, adam: &Adam, step: u64, meter: &Meter) -> anyhow::Result<()> {
+    let point = ResumePoint { config: config.clone(), data_digest: digest.to_owned(), step, loss: meter.loss };
     files::write_atomically(path, &archive::to_bytes(&adam.state(), &point)?)
 }
 
 /// Takes up a saved state; answers the number of steps done and the mean loss.
-fn resume(path: &Path, config: &Config, dataset: &Dataset, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
+fn resume(path: &Path, config: &Config, digest: &str, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
     if !path.exists() {
         return Ok((0, None));
     }
     let mut take_up = || {
         let (state, point): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(path)?)?;
-        let expected = ResumePoint { config: config.clone(), data_digest: dataset.digest().to_owned(), ..point };
+        let expected = ResumePoint { config: config.clone(), data_digest: digest.to_owned(), ..point };
         let same_run = expected.config == point.config && expected.data_digest == point.data_digest;
         ensure!(same_run, "expected the state of this run, {expected:?}, got that of another, {point:?}");
         adam.restore(&state, i32::try_from(point.step)?)?;

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::ingest::Limits;
 use trainer::recordings::Recordings;
+use trainer::train::Demonstrations;
 use trainer::{mirror, replay, verify};
 use wire::demonstration::{DemonstrationStep, RecordedEpisode};
 use wire::{Code, Image};

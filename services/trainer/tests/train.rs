@@ -9,7 +9,7 @@ use cpn::{EncoderConfig, EncoderPreset, MethodKind, checkpoint};
 use recording::Episode;
 use std::path::Path;
 use trainer::progress::{Observer, Progress, StopIf};
-use trainer::train::{self, Config, Outcome};
+use trainer::train::{self, Config, Demonstrations, Outcome};
 
 fn config(folder: &Path, name: &str) -> Config {
     let dataset = folder.join("data");
