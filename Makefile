@@ -8,7 +8,7 @@ EXPORT := export/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset models export-lerobot test test-crash test-export bench-sim lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-export bench-sim lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -42,6 +42,9 @@ demo: build ## Show CPN, TE-BC and random three tasks each, and report who solve
 dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check them (EPISODES=n for fewer)
 	scripts/dataset.sh
 
+jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint errors, pokes, a picture of the trajectories
+	scripts/jenga.sh
+
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
@@ -64,12 +67,12 @@ bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-Wor
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../export && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../export
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export
 
 clean: ## Remove what was built
 	rm -rf target $(WORKER) $(EXPORT) .libtorch
