@@ -5,10 +5,11 @@ TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXPORT := export/.venv
+BENCH := benches/train/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-export bench-sim lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -31,6 +32,10 @@ $(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/script
 
 $(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
 	cd export && $(UV) sync --quiet --locked
+	touch $@
+
+$(BENCH)/.ready: benches/train/pyproject.toml benches/train/uv.lock | $(UV)
+	cd benches/train && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -58,11 +63,21 @@ test: setup ## Everything that must pass
 test-crash: setup ## Kill the recorder a hundred times
 	cargo test --workspace --locked --test crash -- --ignored
 
+test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
+	cargo test --workspace --locked --test swap -- --ignored --nocapture
+
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-bench: $(BENCH)/.ready ## Check the mathematics of the training bench's peers, and its harness
+	cd benches/train && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
 	cd sim-worker && $(UV) run --quiet ../benches/sim.py
+
+bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JAX, in an environment of their own (QUICK=1 for a glance)
+	$(BENCH)/bin/python -m cpn_bench_train.bench --out runs/bench $(if $(QUICK),--quick) \
+		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench train_step --)"
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
@@ -75,4 +90,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export
 
 clean: ## Remove what was built
-	rm -rf target $(WORKER) $(EXPORT) .libtorch
+	rm -rf target $(WORKER) $(EXPORT) $(BENCH) .libtorch

@@ -30,11 +30,11 @@ target/release/cpn-trainer verify --dataset "$dataset" --episodes 21
 episodes=$(printf 'jenga-poke-%d,' {0..20})
 episodes=${episodes%,}
 
-# train OUT H U SEED HINDSIGHT, unless it is done; an interrupted run goes on.
+# train OUT H U SEED GOALS, unless it is done; an interrupted run goes on.
 train() {
   [[ -e $1 ]] && return
-  target/release/cpn-trainer train --dataset "$dataset" --out "$1" --input position --horizon "$2" --updates "$3" \
-    --seed "$4" --hindsight "$5" --epochs 60 --batch-size 64 --threads 1 2>"${1%.safetensors}.log"
+  target/release/cpn-trainer train --preset jenga --dataset "$dataset" --out "$1" --seed "$4" --run-dir "${1%.safetensors}" \
+    --set model.horizon="$2" --set model.updates="$3" --set training.goals="$5" 2>"${1%.safetensors}.log"
 }
 export -f train
 
@@ -45,23 +45,25 @@ plans() {
   started+=($!)
 }
 
-mkdir -p "$out/grid" "$out/final"
+mkdir -p "$out/grid"
 printf '%s\n' "${grid[@]}" | xargs -P 2 -I{} bash -c \
-  'read -r h u <<<"{}"; train '"$out"'/grid/h$h-u$u.safetensors "$h" "$u" 0 0'
+  'read -r h u <<<"{}"; train '"$out"'/grid/h$h-u$u.safetensors "$h" "$u" 0 final'
 plans "$out/grid"
 read -r horizon updates < <($python experiments/jenga/choose.py "$endpoint" grid "$out/grid.json" "$episodes" \
   $(basename -s .safetensors "$out"/grid/*.safetensors))
 echo "chosen: H = $horizon, U = $updates"
+chosen=$out/chosen-h$horizon-u$updates
+mkdir -p "$chosen"
 
 for seed in "${seeds[@]}"; do
-  echo "$out/final/cpn-$seed.safetensors $horizon $updates $seed 0"
-  echo "$out/final/hindsight-$seed.safetensors $horizon $updates $seed 0.5"
+  echo "$chosen/cpn-$seed.safetensors $horizon $updates $seed final"
+  echo "$chosen/hindsight-$seed.safetensors $horizon $updates $seed hindsight"
 done | xargs -P 2 -I{} bash -c 'train {}'
-plans "$out/final"
+plans "$chosen"
 for worker in w0 w1; do
   "$CPN_SIM_WORKER" serve --worker "$worker" --connect "$endpoint" --namespace "$CPN_NAMESPACE" 2>"$out/$worker.log" &
   started+=($!)
 done
-$python experiments/jenga/execute.py "$endpoint" final "$out/trials.json" "$episodes" w0,w1 \
-  "$(basename -s .safetensors "$out"/final/*.safetensors | paste -sd,)"
-$python experiments/jenga/report.py "$out"
+$python experiments/jenga/execute.py "$endpoint" "$(basename "$chosen")" "$chosen" "$episodes" w0,w1 \
+  "$(basename -s .safetensors "$chosen"/*.safetensors | paste -sd,)"
+$python experiments/jenga/report.py "$chosen"

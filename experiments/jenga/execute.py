@@ -3,10 +3,13 @@
 Five ways to move: CPN's trajectory, planned before the hand moves; the same of CPN trained with goals in hindsight; CPN
 planning anew at every step; the recorded actions of the nearest demonstration; a straight line of the fingertip, by
 inverse kinematics. Models are named `cpn-<seed>` and `hindsight-<seed>`.
+
+Each trial is a line of `trials.jsonl` as soon as it is done; a second run makes those that are missing.
 """
 
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -14,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
-from planning import TIMEOUT_SECONDS, Array, Demonstration, Planner, along, demonstrations, network
+from planning import Array, Demonstration, Planner, along, demonstrations, network, request
 
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.jenga import ACTION_METRES
-from cpn_sim_worker.session import ask
+from cpn_sim_worker.session import UnavailableError
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
 
-VARIATIONS = {"jenga-poke": 15, "jenga-poke-offset": 18}
-"""Five fresh starts for each of the three trained targets, three for each of the six that are offset in height."""
+VARIATIONS = {"jenga-poke": 21, "jenga-poke-offset": 24}
+"""Seven fresh starts for each of the three trained targets, four for each of the six that are offset in height."""
 REST_STEPS = 3
 """The hand trails its set point: so long it rests at the end."""
 
@@ -78,7 +81,7 @@ def run(session: zenoh.Session, worker: str, planner: Planner, way: Way, task: s
     """Moves until the block is poked, or for `length` steps and a rest."""
     variation = types_pb2.Variation(task=task, seed=seed)
     reset = sim_pb2.ResetRequest(variation=variation)
-    start = ask(session, keys.sim_reset(worker), reset, sim_pb2.ResetResponse, TIMEOUT_SECONDS)
+    start = request(session, keys.sim_reset(worker), reset, sim_pb2.ResetResponse)
     hand, goal = np.array(start.hand_position, np.float64), np.array(start.goal_position, np.float64)
     planned = None if way.actions is None else way.actions(hand, goal)
     executed, success = [hand.tolist()], False
@@ -89,10 +92,10 @@ def run(session: zenoh.Session, worker: str, planner: Planner, way: Way, task: s
                 action = planner.plan(way.model, hand, goal)[0]
         elif step < len(planned):
             action = planned[step]
-        request = sim_pb2.StepRequest(
+        message = sim_pb2.StepRequest(
             episode_id=start.episode_id, step=step, action=types_pb2.Action(values=action.tolist())
         )
-        response = ask(session, keys.sim_step(worker), request, sim_pb2.StepResponse, TIMEOUT_SECONDS)
+        response = request(session, keys.sim_step(worker), message, sim_pb2.StepResponse)
         hand, success = np.array(response.hand_position, np.float64), response.success
         executed.append(hand.tolist())
         if response.done:
@@ -101,13 +104,22 @@ def run(session: zenoh.Session, worker: str, planner: Planner, way: Way, task: s
     return Trial(way.method, way.model, task, seed, goal.tolist(), predicted, executed, success)
 
 
+def done(path: Path) -> set[tuple[str, str, str, int]]:
+    """The trials of an earlier run; a line that was cut off is removed."""
+    text = path.read_text() if path.exists() else ""
+    path.write_text(text := text[: text.rfind("\n") + 1])
+    trials = map(json.loads, text.splitlines())
+    return {(trial["method"], trial["model"], trial["task"], trial["seed"]) for trial in trials}
+
+
 def main(
-    endpoint: str, planner_name: str, out: Path, episodes: list[str], workers: list[str], models: list[str]
+    endpoint: str, planner_name: str, folder: Path, episodes: list[str], workers: list[str], models: list[str]
 ) -> None:
-    """Shares the trials between the workers and writes them all."""
+    """Shares the trials between the workers, and writes them and the demonstrations to the folder."""
     alive = [keys.planner_alive(planner_name), *map(keys.sim_alive, workers)]
     with network(endpoint, *alive) as session:
         recorded = demonstrations(session, episodes)
+        (folder / "demonstrations.json").write_text(json.dumps([d.positions.tolist() for d in recorded]) + "\n")
         planner, length = Planner(session, planner_name), max(len(d.actions) for d in recorded)
         ways = [Way("line", "", straight), Way("nearest", "", nearest(recorded))]
         for model in models:
@@ -115,19 +127,35 @@ def main(
             ways.append(Way(method, model, lambda s, g, model=model: planner.trajectory(model, s, g, length)))
             if method == "cpn":
                 ways.append(Way("cpn-mpc", model, None))
+        path = folder / "trials.jsonl"
+        earlier = done(path)
         jobs = [
-            (way, task, FIRST_EVALUATION_SEED + i) for task, n in VARIATIONS.items() for i in range(n) for way in ways
+            (way, task, seed)
+            for task, n in VARIATIONS.items()
+            for seed in range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + n)
+            for way in ways
+            if (way.method, way.model, task, seed) not in earlier
         ]
+        writing = threading.Lock()
 
-        def share(number: int) -> list[Trial]:
-            mine = jobs[number :: len(workers)]
-            return [run(session, workers[number], planner, *job, length) for job in mine]
+        def share(number: int) -> int:
+            """Makes the trials of a worker; answers how many it could not."""
+            failed = 0
+            for job in jobs[number :: len(workers)]:
+                try:
+                    trial = run(session, workers[number], planner, *job, length)
+                except UnavailableError as error:
+                    failed += 1
+                    print(f"{job}: {error}", file=sys.stderr)
+                    continue
+                with writing, path.open("a") as file:
+                    file.write(json.dumps(asdict(trial)) + "\n")
+            return failed
 
         with ThreadPoolExecutor(len(workers)) as pool:
-            trials = [trial for part in pool.map(share, range(len(workers))) for trial in part]
-    trajectories = [d.positions.tolist() for d in recorded]
-    document = {"demonstrations": trajectories, "trials": [asdict(trial) for trial in trials]}
-    out.write_text(json.dumps(document) + "\n")
+            failed = sum(pool.map(share, range(len(workers))))
+    if failed:
+        raise SystemExit(f"{failed} of {len(jobs)} trials failed; a second run makes them")
 
 
 if __name__ == "__main__":

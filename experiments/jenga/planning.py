@@ -1,22 +1,31 @@
 """Plans of positions, as the planner answers them."""
 
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import zenoh
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from cpn.v1 import demonstration_pb2, planner_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.jenga import ACTION_METRES
-from cpn_sim_worker.session import ZenohConfig, ask, open_session
+from cpn_sim_worker.session import UnavailableError, ZenohConfig, ask, open_session
 from cpn_sim_worker.wire import decode
 
-TIMEOUT_SECONDS = 60.0
+START_SECONDS = 60.0
+"""How long services may take to start."""
+REQUEST_SECONDS = 10.0
+TRIES = 3
+"""How often a request is sent that nobody answers."""
+
+M = TypeVar("M", bound=Message)
 Array = NDArray[np.float64]
 
 
@@ -37,20 +46,35 @@ def network(endpoint: str, *services: str) -> Iterator[zenoh.Session]:
     """A session in the namespace of this run, once the services of these liveliness keys are there."""
     config = ZenohConfig(connect=(endpoint,), namespace=os.environ.get("CPN_NAMESPACE"))
     with open_session(config) as session:
-        deadline = time.monotonic() + TIMEOUT_SECONDS
+        deadline = time.monotonic() + START_SECONDS
         for key in services:
             while not any(reply.ok is not None for reply in session.liveliness().get(key, timeout=1.0)):
                 if time.monotonic() > deadline:
-                    raise SystemExit(f"{key}: nobody is there")
+                    raise SystemExit(f"{key}: nobody is there after {START_SECONDS} s")
                 time.sleep(0.1)
         yield session
+
+
+def request(session: zenoh.Session, key: str, message: Message, response_type: type[M]) -> M:
+    """The answer of the one service behind `key`. Plans, resets and steps may be asked for twice; a step is applied once.
+
+    Raises:
+        UnavailableError: If no try was answered in time.
+        RequestError: If the service refused the request.
+    """
+    for number in range(1, TRIES):
+        try:
+            return ask(session, key, message, response_type, REQUEST_SECONDS)
+        except UnavailableError as error:
+            print(f"{error}: try {number} of {TRIES}", file=sys.stderr)
+    return ask(session, key, message, response_type, REQUEST_SECONDS)
 
 
 def demonstrations(session: zenoh.Session, episodes: list[str]) -> list[Demonstration]:
     """What the recorder of the session holds of these episodes."""
     found: list[Demonstration] = []
     for episode in episodes:
-        replies = session.get(keys.demonstration_step(episode, "*"), timeout=TIMEOUT_SECONDS)
+        replies = session.get(keys.demonstration_step(episode, "*"), timeout=REQUEST_SECONDS)
         samples = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         steps = sorted((decode(demonstration_pb2.DemonstrationStep, s) for s in samples), key=lambda step: step.step)
         if not steps:
@@ -70,9 +94,8 @@ class Planner:
 
     def plan(self, model: str, hand: Array, goal: Array) -> Array:
         """The next actions of the hand towards the goal, [H, 3], clipped to [-1, 1]."""
-        request = planner_pb2.PlanRequest(model=model, position=_point(hand), goal_position=_point(goal))
-        key = keys.planner_plan(self._name)
-        response = ask(self._session, key, request, planner_pb2.PlanResponse, TIMEOUT_SECONDS)
+        message = planner_pb2.PlanRequest(model=model, position=_point(hand), goal_position=_point(goal))
+        response = request(self._session, keys.planner_plan(self._name), message, planner_pb2.PlanResponse)
         return np.clip([action.values for action in response.actions], -1, 1)
 
     def trajectory(self, model: str, start: Array, goal: Array, length: int) -> Array:

@@ -17,7 +17,7 @@ Trials = list[dict]  # As execute.py wrote them.
 
 METHODS = {
     "cpn": "CPN, one trajectory",
-    "hindsight": "the same, half its goals in hindsight",
+    "hindsight": "the same, goals in hindsight",
     "cpn-mpc": "CPN, planned anew at each step",
     "nearest": "nearest demonstration",
     "line": "straight line, inverse kinematics",
@@ -130,15 +130,16 @@ def draw(demonstrations: list[list[list[float]]], trials: Trials, path: Path) ->
 
 
 def main(folder: Path) -> None:
-    """Reads trials.json and grid.json of a folder; writes report.json, report.md and trajectories.png beside."""
-    document = json.loads((folder / "trials.json").read_text())
-    trials = [measured(trial) for trial in document["trials"]]
+    """Reads what choose.py and execute.py left in a folder; writes report.json, report.md and trajectories.png beside."""
+    demonstrations, grid = (json.loads((folder / f"{name}.json").read_text()) for name in ("demonstrations", "../grid"))
+    # Two workers write as they come; the picture and the pairs want an order.
+    lines = (folder / "trials.jsonl").read_text().splitlines()
+    trials = sorted(map(measured, map(json.loads, lines)), key=lambda trial: trial["seed"])
     rows = summarise(trials)
-    grid = json.loads((folder / "grid.json").read_text())
     report = {"command": "make jenga", "selection": grid, "rows": rows}
     (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     (folder / "report.md").write_text(table(rows))
-    draw(document["demonstrations"], trials, folder / "trajectories.png")
+    draw(demonstrations, trials, folder / "trajectories.png")
     print(table(rows))
 
 

@@ -3,7 +3,7 @@
 use crate::config::{Input, ModelConfig};
 use crate::dynamics::PolicyDynamics;
 use crate::encoder::Encoder;
-use crate::loss;
+use crate::loss::{self, Batch};
 use crate::planner::{InnerLoop, Plan};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -73,22 +73,12 @@ impl Agent {
         &mut self.variables
     }
 
-    /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates.
-    ///
-    /// `observations` and `goals` are `[B, 84, 84, 3]` or `[B, 3]`, `actions` the demonstrated `[B, H, A]`, `mask` `[B, H]` tells
-    /// which of them the demonstration has.
-    pub fn outer_loss(&self, observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Tensor {
-        let needs_goal = self.config.method.is_goal_conditioned() || self.config.method.plans();
-        let (x, x_g) = if needs_goal {
-            let embeddings = self.encoder.encode(&Tensor::cat(&[observations, goals], 0));
-            let mut halves = embeddings.chunk(2, 0).into_iter();
-            (halves.next().expect("first half"), halves.next().expect("second half"))
-        } else {
-            let x = self.encoder.encode(observations);
-            let x_g = x.zeros_like();
-            (x, x_g)
-        };
-        loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), actions, mask)
+    /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates, all of it by
+    /// autograd: the reference for [`loss::OuterLoss`].
+    pub fn outer_loss(&self, batch: &Batch) -> Tensor {
+        let embeddings = self.encoder.encode(&batch.frames);
+        let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));
+        loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), &batch.actions, &batch.mask)
     }
 
     /// The planned actions `[B, H, A]` from x to x_g, both `[B, Z]`, with their graph.

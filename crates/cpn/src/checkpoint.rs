@@ -3,6 +3,7 @@
 use crate::agent::Agent;
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
+use crate::recipe::Training;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -11,10 +12,10 @@ use tch::Kind;
 /// Largest checkpoint that is read, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
 /// Version of the metadata; another one is refused.
-const FORMAT: u32 = 2;
+const FORMAT: u32 = 3;
 
 /// Where a model comes from.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Tasks whose demonstrations it was trained on.
@@ -25,8 +26,8 @@ pub struct Provenance {
     pub render_spec: String,
     /// Seed of initialisation and sampling.
     pub seed: u64,
-    /// Passes over every frame.
-    pub epochs: u32,
+    /// How it was trained.
+    pub training: Training,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -46,6 +47,15 @@ pub struct Checkpoint {
     pub provenance: Provenance,
     /// SHA-256 of the checkpoint's bytes, in hex.
     pub digest: String,
+    /// SHA-256 of the configuration's JSON, as it stands in the metadata, in hex.
+    pub config_digest: String,
+}
+
+impl Checkpoint {
+    /// Digests of what the model was made from: that of the demonstrations, if it is known.
+    pub fn parents(&self) -> Vec<String> {
+        Some(self.provenance.data_digest.clone()).filter(|digest| !digest.is_empty()).into_iter().collect()
+    }
 }
 
 /// Serialises an agent; the same weights give the same bytes.
@@ -73,10 +83,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     }
     let metadata: Metadata = serde_json::from_value(document).map_err(CheckpointError::Metadata)?;
     metadata.model.validate()?;
+    let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
     let mut agent = Agent::new(metadata.model, 0);
     copy_weights(&tensors, &agent)?;
     agent.variables_mut().freeze();
-    Ok(Checkpoint { agent, provenance: metadata.provenance, digest: digest(bytes) })
+    let (digest, config_digest) = (digest(bytes), digest(&config));
+    Ok(Checkpoint { agent, provenance: metadata.provenance, digest, config_digest })
 }
 
 /// SHA-256 of bytes, in hex: how checkpoints are named.

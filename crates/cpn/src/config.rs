@@ -74,19 +74,8 @@ impl ConvConfig {
     }
 }
 
-/// A named image encoder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum EncoderPreset {
-    /// [`EncoderConfig::paper`].
-    Paper,
-    /// [`EncoderConfig::upn`].
-    Upn,
-}
-
 /// What observations and goals are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Input {
     /// Camera images, 84 x 84.
     Image,
@@ -132,15 +121,6 @@ pub struct PositionEncoderConfig {
     pub layer_norm: bool,
 }
 
-impl From<EncoderPreset> for EncoderConfig {
-    fn from(preset: EncoderPreset) -> Self {
-        match preset {
-            EncoderPreset::Paper => Self::paper(),
-            EncoderPreset::Upn => Self::upn(),
-        }
-    }
-}
-
 impl EncoderConfig {
     /// Our reading of the paper's encoder, whose widths stand only in a figure: the three convolutions customary for
     /// 84×84 images, and a latent of 64.
@@ -149,20 +129,6 @@ impl EncoderConfig {
             convolutions: vec![ConvConfig::new(32, 8, 4), ConvConfig::new(64, 4, 2), ConvConfig::new(64, 3, 1)],
             latent: 64,
             layer_norm: true,
-        })
-    }
-
-    /// The encoder of the released code of Universal Planning Networks (Srinivas et al., 2018).
-    pub fn upn() -> Self {
-        Self::Image(ImageEncoderConfig {
-            convolutions: vec![
-                ConvConfig::new(32, 8, 4),
-                ConvConfig::new(64, 4, 2),
-                ConvConfig::new(64, 3, 1),
-                ConvConfig::new(16, 2, 1),
-            ],
-            latent: 128,
-            layer_norm: false,
         })
     }
 
@@ -278,8 +244,8 @@ impl ModelConfig {
     }
 }
 
-fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), ConfigError> {
-    if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { field, value, min, max }) }
+pub(crate) fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> Result<(), ConfigError> {
+    if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError::new(field, value, min, max)) }
 }
 
 /// A configuration value out of its range.
@@ -289,9 +255,15 @@ pub struct ConfigError {
     /// The field at fault.
     pub field: &'static str,
     /// What came.
-    pub value: i64,
+    pub value: String,
     /// Smallest allowed value.
-    pub min: i64,
+    pub min: String,
     /// Largest allowed value.
-    pub max: i64,
+    pub max: String,
+}
+
+impl ConfigError {
+    pub(crate) fn new(field: &'static str, value: impl ToString, min: impl ToString, max: impl ToString) -> Self {
+        Self { field, value: value.to_string(), min: min.to_string(), max: max.to_string() }
+    }
 }

@@ -21,6 +21,28 @@ pub fn from_bytes(data: &[u8]) -> Result<Tensor, ImageError> {
     Ok(Tensor::from_data_size(data, &shape, Kind::Uint8))
 }
 
+/// Images `[B, 84, 84, 3]` as bfloat16, cut into blocks of `size` x `size` pixels that lie one after the other:
+/// `[B, 84 / size, 84 / size, size, size, 3]`. `size` must divide 84.
+pub fn blocks(images: &Tensor, size: usize) -> Tensor {
+    let mut bytes = vec![0; images.numel()];
+    images.copy_data_u8(&mut bytes, images.numel());
+    let run = size * CHANNELS as usize;
+    let mut blocks = Vec::with_capacity(bytes.len());
+    // A band of `size` rows holds a row of blocks.
+    for band in bytes.chunks_exact(run * SIZE as usize) {
+        for block in 0..SIZE as usize / size {
+            for row in band.chunks_exact((SIZE * CHANNELS) as usize) {
+                // The upper half of a float32 is the bfloat16, and 8 bits fit it.
+                let values = row[block * run..][..run].iter();
+                blocks.extend(values.map(|value| (f32::from(*value).to_bits() >> 16) as u16));
+            }
+        }
+    }
+    let (side, size) = (SIZE / size as i64, size as i64);
+    let shape = [images.size()[0], side, side, size, size, CHANNELS];
+    Tensor::from_data_size(bytemuck::cast_slice::<u16, u8>(&blocks), &shape, Kind::BFloat16)
+}
+
 /// Image data of the wrong length.
 #[derive(Debug, thiserror::Error)]
 #[error("image data: expected a multiple of {BYTES} bytes ({SIZE} x {SIZE} RGB8), got {got}")]

@@ -32,7 +32,9 @@ pub mod loss;
 pub mod neuromodulated;
 pub mod planner;
 pub mod positions;
+pub mod recipe;
 
 pub use agent::{Agent, Method, Random};
-pub use config::{EncoderConfig, EncoderPreset, Input, MethodKind, ModelConfig};
+pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
 pub use planner::Plan;
+pub use recipe::{Preset, Recipe, Training};

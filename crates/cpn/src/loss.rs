@@ -1,6 +1,27 @@
-//! The outer loop: behaviour cloning of the planned actions.
+//! The outer loop: behaviour cloning of the planned actions, through the inner loop.
 
+use crate::agent::Agent;
+use crate::fused::{self, OuterLoop, Samples, Weights};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, HashMap};
+use std::time::Instant;
+use tch::kind::Element;
 use tch::{Kind, Tensor};
+
+/// The tensors of a training step.
+#[derive(Debug)]
+pub struct Batch {
+    /// Every image or position of the batch once, `[F, 84, 84, 3]` bytes or `[F, 3]`.
+    pub frames: Tensor,
+    /// Which frame each sample observes, `[B]` integers.
+    pub observations: Tensor,
+    /// Which frame is its goal, `[B]` integers.
+    pub goals: Tensor,
+    /// The demonstrated actions that follow, `[B, H, A]`; 0 past the demonstration's end.
+    pub actions: Tensor,
+    /// 1 where there is an action, else 0, `[B, H]`.
+    pub mask: Tensor,
+}
 
 /// Mean squared error between planned and demonstrated actions, both `[B, H, A]`, over the steps that the demonstration
 /// still has: `mask` `[B, H]` is 1 there and 0 past its end.
@@ -8,4 +29,90 @@ pub fn behaviour_cloning(planned: &Tensor, demonstrated: &Tensor, mask: &Tensor)
     let actions = planned.size()[2] as f64;
     let squared = (planned - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);
     (squared * mask).sum(None::<Kind>) / (mask.sum(None::<Kind>) * actions)
+}
+
+/// What the encoder computes in while training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// As everywhere else.
+    Float32,
+    /// Twice as fast where the processor multiplies it, and close ([`crate::encoder::Encoder::encode_in_bfloat16`]).
+    Bfloat16,
+}
+
+/// An outer loss and what it changes by when the weights do.
+#[derive(Debug)]
+pub struct Gradient {
+    /// The loss.
+    pub loss: f64,
+    /// By the name of the weight, row by row.
+    pub weights: BTreeMap<String, Vec<f32>>,
+    /// How long the encoder took, both ways, in seconds.
+    pub encoder_seconds: f64,
+}
+
+/// Differentiates outer losses fast: the encoder by autograd, everything past it by hand ([`crate::fused`]).
+#[derive(Debug)]
+pub struct OuterLoss {
+    fused: OuterLoop<f32>,
+    precision: Precision,
+}
+
+impl OuterLoss {
+    /// For agents like this one, in float32, on some threads.
+    pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
+        Self { fused: OuterLoop::new(agent.config().clone(), threads), precision }
+    }
+
+    /// The outer loss of a batch and its gradient, by the name of each weight that takes part; agrees with what autograd
+    /// makes of [`Agent::outer_loss`].
+    pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
+        let started = Instant::now();
+        let embeddings = match self.precision {
+            Precision::Float32 => agent.encoder().encode(&batch.frames),
+            Precision::Bfloat16 => agent.encoder().encode_in_bfloat16(&batch.frames),
+        };
+        let values = floats(&embeddings.detach());
+        let encoding = started.elapsed();
+        let latent = embeddings.size()[1] as usize;
+        let rows = |indices: &Tensor| floats::<i64>(indices).into_iter().map(|row| row as usize * latent);
+        let gather = |indices| rows(indices).flat_map(|at| &values[at..at + latent]).copied().collect::<Vec<f32>>();
+        let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
+        let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
+        let variables = agent.variables().variables();
+        let samples = Samples { x: &x, x_g: &x_g, actions: &actions, mask: &mask };
+        let outer = self.fused.run(&Variables(&variables), samples);
+
+        let mut hat = vec![0.0; values.len()];
+        for (indices, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
+            for (at, gradient) in rows(indices).zip(gradient.chunks_exact(latent)) {
+                fused::add(&mut hat[at..at + latent], gradient);
+            }
+        }
+        let started = Instant::now();
+        // Autograd is told the gradient in the embeddings by a sum that has it.
+        let sum = (&embeddings * Tensor::from_slice(&hat).view_as(&embeddings)).sum(None::<Kind>);
+        let (names, weights): (Vec<_>, Vec<_>) =
+            variables.iter().filter(|(name, _)| name.starts_with("encoder.")).unzip();
+        let in_encoder = Tensor::run_backward(&[sum], &weights, false, false);
+        let in_encoder = names.into_iter().cloned().zip(in_encoder.iter().map(floats));
+        Gradient {
+            loss: outer.loss.into(),
+            weights: outer.weights.into_iter().chain(in_encoder).collect(),
+            encoder_seconds: (encoding + started.elapsed()).as_secs_f64(),
+        }
+    }
+}
+
+struct Variables<'a>(&'a HashMap<String, Tensor>);
+
+impl<T: Element + Copy> Weights<T> for Variables<'_> {
+    fn get(&self, name: &str) -> Vec<T> {
+        floats(&self.0[name])
+    }
+}
+
+fn floats<T: Element + Copy>(tensor: &Tensor) -> Vec<T> {
+    Vec::try_from(tensor.flatten(0, -1)).expect("a tensor of the kind that was asked for")
 }

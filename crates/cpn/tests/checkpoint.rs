@@ -16,7 +16,7 @@ fn provenance() -> Provenance {
         data_digest: "d".into(),
         render_spec: r#"{"camera":"corner"}"#.into(),
         seed: 5,
-        epochs: 2,
+        training: cpn::Training::paper(),
     }
 }
 
@@ -46,7 +46,22 @@ fn a_checkpoint_comes_back_whole() {
         assert_eq!(loaded.agent.plan(&x, &x, 0).actions, agent.plan(&x, &x, 0).actions);
         assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
+        assert_eq!(loaded.parents(), ["d"]);
     }
+}
+
+#[test]
+fn the_configuration_has_a_digest_of_its_own() {
+    let config = |agent: &Agent| {
+        checkpoint::from_bytes(&checkpoint::to_bytes(agent, &provenance()).unwrap()).unwrap().config_digest
+    };
+    let (_, metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
+    let agent = Agent::new(small_config(MethodKind::Cpn), 5);
+    let json = serde_json::to_string(agent.config()).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&json).unwrap(), metadata["model"]);
+    assert_eq!(config(&agent), checkpoint::digest(json.as_bytes()));
+    assert_eq!(config(&agent), config(&Agent::new(small_config(MethodKind::Cpn), 6)), "whatever the weights");
+    assert_ne!(config(&agent), config(&Agent::new(small_config(MethodKind::Upn), 5)));
 }
 
 #[test]
@@ -70,10 +85,10 @@ fn an_oversized_file_is_refused() {
 
 #[test]
 fn another_format_is_refused() {
-    assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 2, got 1");
+    assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 3, got 1");
     // An older one lacks fields: that it is older is what counts.
-    assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 2, got 1");
-    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 2, got null");
+    assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 3, got 1");
+    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 3, got null");
 }
 
 #[test]

@@ -23,8 +23,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
 }
 
 fn check(config: ModelConfig, rows: i64, threads: usize) {
-    let mut agent = common::double_agent(config.clone());
-    agent.variables_mut().double();
+    let agent = common::double_agent(config.clone());
     let latent = config.encoder.latent();
     let scale = 2.0;
     let x = (uniform(&[rows, latent], 1) * scale).set_requires_grad(true);

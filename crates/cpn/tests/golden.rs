@@ -35,12 +35,9 @@ fn check(method: &str) {
     assert_close("actions", &plan.actions, &golden["actions"]);
     assert_close("inner_losses", &Tensor::stack(&plan.inner_losses, 0), &golden["inner_losses"]);
 
-    let loss = agent.outer_loss(
-        &golden["observations"],
-        &golden["goals"],
-        &golden["demonstrated"],
-        &golden["mask"].to_kind(Kind::Double),
-    );
+    let mask = golden["mask"].to_kind(Kind::Double);
+    let batch = common::paired(&golden["observations"], &golden["goals"], &golden["demonstrated"], &mask);
+    let loss = agent.outer_loss(&batch);
     assert_close("outer_loss", &loss, &golden["outer_loss"]);
     loss.backward();
     for (name, variable) in agent.variables().variables() {

@@ -4,7 +4,8 @@
 
 mod common;
 
-use common::{double_agent, noise_images, position_config, small_config, uniform};
+use common::{double_agent, noise_images, paired, position_config, small_config, uniform};
+use cpn::loss::Batch;
 use cpn::neuromodulated::Neuromodulated;
 use cpn::planner::InnerLoop;
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Random, positions};
@@ -15,15 +16,16 @@ fn max_difference(a: &Tensor, b: &Tensor) -> f64 {
     (a - b).abs().max().double_value(&[])
 }
 
-/// A batch for the outer loss: observations, goals, demonstrated actions, mask.
-fn batch(config: &ModelConfig, size: i64) -> (Tensor, Tensor, Tensor, Tensor) {
+/// A batch for the outer loss.
+fn batch(config: &ModelConfig, size: i64) -> Batch {
     let inputs = |seed| match config.encoder {
         EncoderConfig::Image(_) => noise_images(size, seed),
         EncoderConfig::Position(_) => uniform(&[size, 3], seed),
     };
     let (observations, goals) = (inputs(1), inputs(2));
     let actions = uniform(&[size, config.horizon, config.actions], 3);
-    (observations, goals, actions, Tensor::ones([size, config.horizon], (Kind::Double, Device::Cpu)))
+    let mask = Tensor::ones([size, config.horizon], (Kind::Double, Device::Cpu));
+    paired(&observations, &goals, &actions, &mask)
 }
 
 /// The outer gradient, which for planning methods is of second order, against central differences, at the largest
@@ -34,8 +36,8 @@ fn outer_gradients_match_finite_differences() {
     for config in methods.flat_map(|method| [small_config(method), position_config(method)]) {
         let method = config.method;
         let agent = double_agent(config);
-        let (observations, goals, actions, mask) = batch(agent.config(), 3);
-        let loss = || agent.outer_loss(&observations, &goals, &actions, &mask);
+        let batch = batch(agent.config(), 3);
+        let loss = || agent.outer_loss(&batch);
         loss().backward();
         let mut seen = 0;
         for (name, variable) in agent.variables().variables() {
@@ -68,8 +70,7 @@ fn outer_gradients_match_finite_differences() {
 fn the_step_size_learns_through_the_update() {
     for method in [MethodKind::Upn, MethodKind::Cpn] {
         let agent = double_agent(small_config(method));
-        let (observations, goals, actions, mask) = batch(agent.config(), 2);
-        agent.outer_loss(&observations, &goals, &actions, &mask).backward();
+        agent.outer_loss(&batch(agent.config(), 2)).backward();
         let gradient = agent.variables().variables()["step_size"].grad().double_value(&[]);
         assert!(gradient.abs() > 0.0, "{method}: the outer loss must depend on the inner update");
     }
@@ -162,12 +163,12 @@ fn each_method_sees_what_it_should() {
 #[test]
 fn steps_past_the_demonstration_do_not_count() {
     let agent = double_agent(small_config(MethodKind::Cpn));
-    let (observations, goals, actions, mask) = batch(agent.config(), 2);
-    let _ = mask.get(1).narrow(0, 2, 3).fill_(0.0);
-    let loss = |actions: &Tensor| agent.outer_loss(&observations, &goals, actions, &mask).double_value(&[]);
-    let before = loss(&actions);
-    let _ = actions.get(1).narrow(0, 2, 3).fill_(9.0);
-    assert!((loss(&actions) - before).abs() < 1e-12);
+    let batch = batch(agent.config(), 2);
+    let _ = batch.mask.get(1).narrow(0, 2, 3).fill_(0.0);
+    let loss = || agent.outer_loss(&batch).double_value(&[]);
+    let before = loss();
+    let _ = batch.actions.get(1).narrow(0, 2, 3).fill_(9.0);
+    assert!((loss() - before).abs() < 1e-12);
 }
 
 #[test]
@@ -195,7 +196,7 @@ fn positions_are_standardised() {
 
 #[test]
 fn every_preset_builds() {
-    for encoder in [EncoderConfig::paper(), EncoderConfig::upn(), EncoderConfig::position([500, 0, 200], 100)] {
+    for encoder in [EncoderConfig::paper(), EncoderConfig::position([500, 0, 200], 100)] {
         for method in MethodKind::ALL {
             let config = ModelConfig { encoder: encoder.clone(), ..ModelConfig::paper(method) };
             config.validate().unwrap();

@@ -2,12 +2,39 @@
 
 use anyhow::Context;
 use std::fs::{File, Permissions};
-use std::io::Write;
+use std::io::{Read, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 /// How the names of temporary files begin.
 const UNFINISHED: &str = ".unfinished-";
+/// Name of the file in a folder that the process that keeps it has locked.
+const LOCK: &str = ".lock";
+
+/// Makes a folder, if there is none, and takes it over for as long as the answer lives: two processes would each know a
+/// part of what is in it.
+///
+/// # Errors
+/// If the folder cannot be made, or another process has it.
+pub fn take_over(folder: &Path) -> anyhow::Result<File> {
+    std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+    let lock = File::create(folder.join(LOCK)).with_context(|| folder.display().to_string())?;
+    lock.try_lock().with_context(|| format!("{}: expected a folder that no process keeps", folder.display()))?;
+    Ok(lock)
+}
+
+/// A regular file's bytes, from the beginning and so many at most.
+///
+/// # Errors
+/// If it cannot be read, or is no regular file: reading from one that is not may never end.
+pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
+    if !path.metadata()?.is_file() {
+        return Err(std::io::Error::other("not a regular file"));
+    }
+    let mut bytes = Vec::new();
+    File::open(path)?.take(max_bytes as u64).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
 
 /// Writes a file by way of a temporary one beside it, so that no reader ever sees a part. When this returns, the file
 /// outlasts a crash.

@@ -1,25 +1,46 @@
 //! Publishing checkpoints, from the trainer to planners.
 
-use crate::message::{digest, name};
+use crate::message::{digest, name, required};
 use crate::{Error, Message, proto};
+use serde::{Deserialize, Serialize};
 
 /// Largest piece of a checkpoint in one reply: zenoh's batch size.
 pub const MAX_CHUNK_BYTES: u32 = 65_536;
+/// Most parents of a checkpoint.
+const MAX_PARENTS: usize = 64;
 
-/// Tells planners of a new checkpoint.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CheckpointAnnouncement {
+/// What a published checkpoint is. As JSON it lies beside the weights.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckpointManifest {
     /// Name to serve the model under.
     pub model: String,
+    /// Counts the checkpoints of this name, from 1.
+    pub version: u32,
     /// SHA-256 of the checkpoint, in hex.
     pub digest: String,
     /// Its size.
     pub size_bytes: u64,
+    /// SHA-256 of the model's configuration, in hex.
+    pub config_digest: String,
+    /// Digests of what it was made from, in hex.
+    pub parents: Vec<String>,
 }
 
-/// Asks for one piece of an announced checkpoint.
+/// Tells planners which version of a model to serve.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CheckpointAnnouncement {
+    /// What to serve.
+    pub manifest: CheckpointManifest,
+    /// Of two announcements the one with the greater value holds.
+    pub promoted_unix_nanos: u64,
+}
+
+/// Asks for one piece of a published checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CheckpointChunkRequest {
+    /// SHA-256 of the checkpoint, in hex.
+    pub digest: String,
     /// Where the piece starts.
     pub offset_bytes: u64,
     /// How long it is.
@@ -33,6 +54,91 @@ pub struct CheckpointChunkResponse {
     pub data: Vec<u8>,
 }
 
+/// Asks for the versions that are kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ListVersionsRequest {
+    /// Of one model, or of all.
+    pub model: Option<String>,
+}
+
+/// The versions that are kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ListVersionsResponse {
+    /// By model and version.
+    pub versions: Vec<CheckpointVersion>,
+}
+
+/// A version that is kept.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct CheckpointVersion {
+    /// What it is.
+    #[serde(flatten)]
+    pub manifest: CheckpointManifest,
+    /// Whether it is the one that planners are told to serve.
+    pub promoted: bool,
+}
+
+/// Lets planners serve a version that is kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PromoteVersionRequest {
+    /// Name of the model.
+    pub model: String,
+    /// The version to serve.
+    pub version: u32,
+}
+
+/// The version that is promoted now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PromoteVersionResponse {
+    /// What it is.
+    pub manifest: CheckpointManifest,
+}
+
+/// Lets planners serve the version that was promoted before.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RollBackRequest {
+    /// Name of the model.
+    pub model: String,
+}
+
+/// The version that is promoted now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RollBackResponse {
+    /// What it is.
+    pub manifest: CheckpointManifest,
+}
+
+impl Message for CheckpointManifest {
+    type Proto = proto::CheckpointManifest;
+}
+
+impl TryFrom<proto::CheckpointManifest> for CheckpointManifest {
+    type Error = Error;
+
+    fn try_from(manifest: proto::CheckpointManifest) -> Result<Self, Error> {
+        let proto::CheckpointManifest { model, version: number, digest: sha256, size_bytes, config_digest, parents } =
+            manifest;
+        if parents.len() > MAX_PARENTS {
+            return Err(Error::invalid("parents", format!("at most {MAX_PARENTS}"), parents.len()));
+        }
+        Ok(Self {
+            model: name("model", model)?,
+            version: version(number)?,
+            digest: digest("digest", sha256)?,
+            size_bytes,
+            config_digest: digest("config_digest", config_digest)?,
+            parents: parents.into_iter().map(|parent| digest("parents", parent)).collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+impl From<CheckpointManifest> for proto::CheckpointManifest {
+    fn from(manifest: CheckpointManifest) -> Self {
+        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents } = manifest;
+        Self { model, version, digest, size_bytes, config_digest, parents }
+    }
+}
+
 impl Message for CheckpointAnnouncement {
     type Proto = proto::CheckpointAnnouncement;
 }
@@ -41,18 +147,15 @@ impl TryFrom<proto::CheckpointAnnouncement> for CheckpointAnnouncement {
     type Error = Error;
 
     fn try_from(announcement: proto::CheckpointAnnouncement) -> Result<Self, Error> {
-        Ok(Self {
-            model: name("model", announcement.model)?,
-            digest: digest("digest", announcement.digest)?,
-            size_bytes: announcement.size_bytes,
-        })
+        let proto::CheckpointAnnouncement { manifest, promoted_unix_nanos } = announcement;
+        Ok(Self { manifest: required("manifest", manifest)?, promoted_unix_nanos })
     }
 }
 
 impl From<CheckpointAnnouncement> for proto::CheckpointAnnouncement {
     fn from(announcement: CheckpointAnnouncement) -> Self {
-        let CheckpointAnnouncement { model, digest, size_bytes } = announcement;
-        Self { model, digest, size_bytes }
+        let CheckpointAnnouncement { manifest, promoted_unix_nanos } = announcement;
+        Self { manifest: Some(manifest.into()), promoted_unix_nanos }
     }
 }
 
@@ -64,18 +167,18 @@ impl TryFrom<proto::CheckpointChunkRequest> for CheckpointChunkRequest {
     type Error = Error;
 
     fn try_from(request: proto::CheckpointChunkRequest) -> Result<Self, Error> {
-        let proto::CheckpointChunkRequest { offset_bytes, length_bytes } = request;
+        let proto::CheckpointChunkRequest { digest: sha256, offset_bytes, length_bytes } = request;
         if !(1..=MAX_CHUNK_BYTES).contains(&length_bytes) {
             return Err(Error::invalid("length_bytes", format!("1 to {MAX_CHUNK_BYTES}"), length_bytes));
         }
-        Ok(Self { offset_bytes, length_bytes })
+        Ok(Self { digest: digest("digest", sha256)?, offset_bytes, length_bytes })
     }
 }
 
 impl From<CheckpointChunkRequest> for proto::CheckpointChunkRequest {
     fn from(request: CheckpointChunkRequest) -> Self {
-        let CheckpointChunkRequest { offset_bytes, length_bytes } = request;
-        Self { offset_bytes, length_bytes }
+        let CheckpointChunkRequest { digest, offset_bytes, length_bytes } = request;
+        Self { digest, offset_bytes, length_bytes }
     }
 }
 
@@ -95,4 +198,133 @@ impl From<CheckpointChunkResponse> for proto::CheckpointChunkResponse {
     fn from(response: CheckpointChunkResponse) -> Self {
         Self { data: response.data }
     }
+}
+
+impl Message for ListVersionsRequest {
+    type Proto = proto::ListVersionsRequest;
+}
+
+impl TryFrom<proto::ListVersionsRequest> for ListVersionsRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::ListVersionsRequest) -> Result<Self, Error> {
+        let model = Some(request.model).filter(|model| !model.is_empty());
+        Ok(Self { model: model.map(|model| name("model", model)).transpose()? })
+    }
+}
+
+impl From<ListVersionsRequest> for proto::ListVersionsRequest {
+    fn from(request: ListVersionsRequest) -> Self {
+        Self { model: request.model.unwrap_or_default() }
+    }
+}
+
+impl Message for ListVersionsResponse {
+    type Proto = proto::ListVersionsResponse;
+}
+
+impl TryFrom<proto::ListVersionsResponse> for ListVersionsResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::ListVersionsResponse) -> Result<Self, Error> {
+        let versions = response.versions.into_iter().map(CheckpointVersion::try_from).collect::<Result<_, _>>();
+        Ok(Self { versions: versions.map_err(|e| e.within("versions"))? })
+    }
+}
+
+impl From<ListVersionsResponse> for proto::ListVersionsResponse {
+    fn from(response: ListVersionsResponse) -> Self {
+        Self { versions: response.versions.into_iter().map(Into::into).collect() }
+    }
+}
+
+impl TryFrom<proto::CheckpointVersion> for CheckpointVersion {
+    type Error = Error;
+
+    fn try_from(version: proto::CheckpointVersion) -> Result<Self, Error> {
+        Ok(Self { manifest: required("manifest", version.manifest)?, promoted: version.promoted })
+    }
+}
+
+impl From<CheckpointVersion> for proto::CheckpointVersion {
+    fn from(version: CheckpointVersion) -> Self {
+        Self { manifest: Some(version.manifest.into()), promoted: version.promoted }
+    }
+}
+
+impl Message for PromoteVersionRequest {
+    type Proto = proto::PromoteVersionRequest;
+}
+
+impl TryFrom<proto::PromoteVersionRequest> for PromoteVersionRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::PromoteVersionRequest) -> Result<Self, Error> {
+        Ok(Self { model: name("model", request.model)?, version: version(request.version)? })
+    }
+}
+
+impl From<PromoteVersionRequest> for proto::PromoteVersionRequest {
+    fn from(request: PromoteVersionRequest) -> Self {
+        Self { model: request.model, version: request.version }
+    }
+}
+
+impl Message for PromoteVersionResponse {
+    type Proto = proto::PromoteVersionResponse;
+}
+
+impl TryFrom<proto::PromoteVersionResponse> for PromoteVersionResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::PromoteVersionResponse) -> Result<Self, Error> {
+        Ok(Self { manifest: required("manifest", response.manifest)? })
+    }
+}
+
+impl From<PromoteVersionResponse> for proto::PromoteVersionResponse {
+    fn from(response: PromoteVersionResponse) -> Self {
+        Self { manifest: Some(response.manifest.into()) }
+    }
+}
+
+impl Message for RollBackRequest {
+    type Proto = proto::RollBackRequest;
+}
+
+impl TryFrom<proto::RollBackRequest> for RollBackRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::RollBackRequest) -> Result<Self, Error> {
+        Ok(Self { model: name("model", request.model)? })
+    }
+}
+
+impl From<RollBackRequest> for proto::RollBackRequest {
+    fn from(request: RollBackRequest) -> Self {
+        Self { model: request.model }
+    }
+}
+
+impl Message for RollBackResponse {
+    type Proto = proto::RollBackResponse;
+}
+
+impl TryFrom<proto::RollBackResponse> for RollBackResponse {
+    type Error = Error;
+
+    fn try_from(response: proto::RollBackResponse) -> Result<Self, Error> {
+        Ok(Self { manifest: required("manifest", response.manifest)? })
+    }
+}
+
+impl From<RollBackResponse> for proto::RollBackResponse {
+    fn from(response: RollBackResponse) -> Self {
+        Self { manifest: Some(response.manifest.into()) }
+    }
+}
+
+/// A version of a model: 1 or more.
+fn version(number: u32) -> Result<u32, Error> {
+    if number == 0 { Err(Error::invalid("version", "1 or more", number)) } else { Ok(number) }
 }

@@ -52,6 +52,20 @@ keys! {
     checkpoint_announcement(model) = "cpn/@v1/checkpoint/${model:*}/announcement";
     /// Queryable: [`crate::checkpoint::CheckpointChunkRequest`].
     checkpoint_chunk(digest) = "cpn/@v1/checkpoint/${digest:*}/chunk";
+    /// Queryable: [`crate::checkpoint::ListVersionsRequest`].
+    checkpoint_list_versions(model) = "cpn/@v1/checkpoint/${model:*}/list_versions";
+    /// Queryable: [`crate::checkpoint::PromoteVersionRequest`].
+    checkpoint_promote(model) = "cpn/@v1/checkpoint/${model:*}/promote";
+    /// Queryable: [`crate::checkpoint::RollBackRequest`].
+    checkpoint_roll_back(model) = "cpn/@v1/checkpoint/${model:*}/roll_back";
+    /// Queryable: [`crate::training::StartRunRequest`].
+    trainer_start_run(trainer) = "cpn/@v1/trainer/${trainer:*}/start_run";
+    /// Queryable: [`crate::training::StopRunRequest`].
+    trainer_stop_run(trainer) = "cpn/@v1/trainer/${trainer:*}/stop_run";
+    /// Queryable: [`crate::training::ListRunsRequest`].
+    trainer_list_runs(trainer) = "cpn/@v1/trainer/${trainer:*}/list_runs";
+    /// Published [`crate::training::Run`].
+    training_progress(run) = "cpn/@v1/training/${run:*}/progress";
     /// Liveliness token of a planner.
     planner_alive(planner) = "cpn/@v1/alive/planner/${planner:*}";
     /// Liveliness token of a simulator worker.
@@ -71,9 +85,4 @@ pub fn episode_of_demonstration_step(key: &keyexpr) -> Option<String> {
 /// The episode, or `*`, in the key of its recording.
 pub fn episode_of_demonstration_recorded(key: &keyexpr) -> Option<String> {
     Some(format::demonstration_recorded::parse(key).ok()?.episode().to_string())
-}
-
-/// The digest in the key of a checkpoint's pieces.
-pub fn digest_of_checkpoint_chunk(key: &keyexpr) -> Option<String> {
-    Some(format::checkpoint_chunk::parse(key).ok()?.digest().to_string())
 }

@@ -6,6 +6,7 @@
 pub mod checkpoint;
 pub mod demonstration;
 mod error;
+pub mod grpc;
 mod image;
 pub mod key;
 mod message;
@@ -13,6 +14,7 @@ mod observation;
 pub mod planner;
 pub mod query;
 pub mod sim;
+pub mod training;
 
 pub use error::{Code, Error};
 pub use image::Image;

@@ -28,6 +28,8 @@ pub struct PlanRequest {
     pub seed: u64,
     /// How long after its arrival the answer is still of use, in whole milliseconds.
     pub deadline: Option<Duration>,
+    /// The checkpoint that must answer; any if none.
+    pub model_digest: Option<String>,
 }
 
 /// A plan.
@@ -123,6 +125,8 @@ pub struct ModelInfo {
     pub training_tasks: Vec<String>,
     /// Number of actions in a plan.
     pub horizon: u32,
+    /// That of its manifest; 0 for a checkpoint that was not published.
+    pub version: u32,
 }
 
 impl Message for PlanRequest {
@@ -156,6 +160,9 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
             observation,
             seed: request.seed,
             deadline: (request.deadline_ms > 0).then(|| Duration::from_millis(request.deadline_ms.into())),
+            model_digest: (!request.model_digest.is_empty())
+                .then(|| digest("model_digest", request.model_digest))
+                .transpose()?,
         })
     }
 }
@@ -175,6 +182,7 @@ impl From<PlanRequest> for proto::PlanRequest {
             }),
             seed: request.seed,
             deadline_ms: request.deadline.map_or(0, |d| u32::try_from(d.as_millis()).unwrap_or(u32::MAX)),
+            model_digest: request.model_digest.unwrap_or_default(),
         }
     }
 }
@@ -347,14 +355,15 @@ impl TryFrom<proto::ModelInfo> for ModelInfo {
     type Error = Error;
 
     fn try_from(info: proto::ModelInfo) -> Result<Self, Error> {
-        let proto::ModelInfo { name: model, method, digest: sha256, training_tasks, horizon } = info;
-        Ok(Self { name: name("name", model)?, method, digest: digest("digest", sha256)?, training_tasks, horizon })
+        let proto::ModelInfo { name: model, method, digest: sha256, training_tasks, horizon, version } = info;
+        let (name, digest) = (name("name", model)?, digest("digest", sha256)?);
+        Ok(Self { name, method, digest, training_tasks, horizon, version })
     }
 }
 
 impl From<ModelInfo> for proto::ModelInfo {
     fn from(info: ModelInfo) -> Self {
-        let ModelInfo { name, method, digest, training_tasks, horizon } = info;
-        Self { name, method, digest, training_tasks, horizon }
+        let ModelInfo { name, method, digest, training_tasks, horizon, version } = info;
+        Self { name, method, digest, training_tasks, horizon, version }
     }
 }

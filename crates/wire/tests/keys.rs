@@ -26,13 +26,20 @@ fn keys_are_the_ones_agreed_upon() {
             "planner_load_model" => key::planner_load_model(&chunk("planner")),
             "planner_list_models" => key::planner_list_models(&chunk("planner")),
             "planner_alive" => key::planner_alive(&chunk("planner")),
+            "trainer_start_run" => key::trainer_start_run(&chunk("trainer")),
+            "trainer_stop_run" => key::trainer_stop_run(&chunk("trainer")),
+            "trainer_list_runs" => key::trainer_list_runs(&chunk("trainer")),
+            "training_progress" => key::training_progress(&chunk("run")),
             "checkpoint_announcement" => key::checkpoint_announcement(&chunk("model")),
             "checkpoint_chunk" => key::checkpoint_chunk(&chunk("digest")),
+            "checkpoint_list_versions" => key::checkpoint_list_versions(&chunk("model")),
+            "checkpoint_promote" => key::checkpoint_promote(&chunk("model")),
+            "checkpoint_roll_back" => key::checkpoint_roll_back(&chunk("model")),
             other => panic!("keys.json names {other}, which is not tested here"),
         };
         assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
     }
-    assert_eq!(golden.len(), 15, "every key is in the file");
+    assert_eq!(golden.len(), 22, "every key is in the file");
 }
 
 #[test]

@@ -3,10 +3,12 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use prost::Message as _;
+use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::proto::plan_request::{Goal, Observed};
 use wire::sim::{StepRequest, StepResponse};
+use wire::training::{Run, StartRunRequest};
 use wire::{Code, Error, decode, proto};
 
 fn black(side: u32) -> proto::Image {
@@ -44,7 +46,7 @@ fn the_unspoiled_request_is_fine() {
 
 #[test]
 fn each_wrong_field_is_named() {
-    let cases: [(Error, &str, &str, &str); 11] = [
+    let cases: [(Error, &str, &str, &str); 12] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -52,6 +54,12 @@ fn each_wrong_field_is_named() {
             "goal_id",
             "64 lower-case hexadecimal digits",
             "\"zz\"",
+        ),
+        (
+            refusal(|r| r.model_digest = "5F".repeat(32)),
+            "model_digest",
+            "64 lower-case hexadecimal digits",
+            &format!("{:?}", "5F".repeat(32)),
         ),
         (refusal(|r| r.observed = None), "observation", "a value", "none"),
         (refusal(|r| image_of(r).format = 0), "observation.format", "PIXEL_FORMAT_RGB8", "PIXEL_FORMAT_UNSPECIFIED"),
@@ -170,6 +178,91 @@ fn each_wrong_field_of_a_step_is_named() {
         let mut step = good();
         spoil(&mut step);
         let error = decode::<DemonstrationStep>(&step.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_an_announcement_is_named() {
+    let digest = || "0".repeat(64);
+    let good = || proto::CheckpointManifest {
+        model: "cpn".into(),
+        version: 1,
+        digest: digest(),
+        size_bytes: 1,
+        config_digest: digest(),
+        parents: vec![digest()],
+    };
+    let decode = |manifest| {
+        let announcement = proto::CheckpointAnnouncement { manifest, promoted_unix_nanos: 1 };
+        decode::<CheckpointAnnouncement>(&announcement.encode_to_vec())
+    };
+    decode(Some(good())).unwrap();
+    assert_eq!(decode(None).unwrap_err().field, "manifest");
+    type Spoil = fn(&mut proto::CheckpointManifest);
+    let cases: [(Spoil, &str, &str); 6] = [
+        (|m| m.model = "../x".into(), "manifest.model", "\"../x\""),
+        (|m| m.version = 0, "manifest.version", "0"),
+        (|m| m.digest = "zz".into(), "manifest.digest", "\"zz\""),
+        (|m| m.config_digest = String::new(), "manifest.config_digest", "\"\""),
+        (|m| m.parents = vec!["zz".into()], "manifest.parents", "\"zz\""),
+        (|m| m.parents = vec!["0".repeat(64); 65], "manifest.parents", "65"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut manifest = good();
+        spoil(&mut manifest);
+        let error = decode(Some(manifest)).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_a_run_is_named() {
+    let good = || proto::Run {
+        name: "cpn".into(),
+        state: proto::RunState::Finished.into(),
+        progress: Some(proto::TrainingProgress { step: 3, steps: 9, ..Default::default() }),
+        digest: "0".repeat(64),
+        reason: String::new(),
+    };
+    decode::<Run>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::Run);
+    let cases: [(Spoil, &str, &str); 6] = [
+        (|r| r.name = "a/b".into(), "name", "\"a/b\""),
+        (|r| r.state = 0, "state", "RUN_STATE_UNSPECIFIED"),
+        (|r| r.digest = "ABC".into(), "digest", "\"ABC\""),
+        (|r| (r.state, r.reason) = (proto::RunState::Failed.into(), "x".repeat(2001)), "reason", "2001 bytes"),
+        (|r| r.progress = Some(proto::TrainingProgress::default()), "progress.steps", "0"),
+        (
+            |r| r.progress = Some(proto::TrainingProgress { steps: 1, loss: f64::NAN, ..Default::default() }),
+            "progress.loss",
+            "NaN",
+        ),
+    ];
+    for (spoil, field, got) in cases {
+        let mut run = good();
+        spoil(&mut run);
+        let error = decode::<Run>(&run.encode_to_vec()).unwrap_err();
+        assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
+    }
+}
+
+#[test]
+fn each_wrong_field_of_a_start_is_named() {
+    let good = || proto::StartRunRequest { name: "cpn".into(), ..Default::default() };
+    decode::<StartRunRequest>(&good().encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::StartRunRequest);
+    let cases: [(Spoil, &str, &str); 5] = [
+        (|r| r.name = String::new(), "name", "\"\""),
+        (|r| r.preset = "A".into(), "preset", "\"A\""),
+        (|r| r.hold_out = vec!["reach".into(), "../reach".into()], "hold_out", "\"../reach\""),
+        (|r| r.hold_out = vec!["reach".into(); 1001], "hold_out", "1001"),
+        (|r| r.settings = "#".repeat((16 << 10) + 1), "settings", "16385 bytes"),
+    ];
+    for (spoil, field, got) in cases {
+        let mut request = good();
+        spoil(&mut request);
+        let error = decode::<StartRunRequest>(&request.encode_to_vec()).unwrap_err();
         assert_eq!((error.field.as_str(), error.got.as_str()), (field, got));
     }
 }

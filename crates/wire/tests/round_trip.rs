@@ -10,6 +10,7 @@ use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
 use wire::sim::*;
+use wire::training::*;
 use wire::{Image, Message, Position, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
@@ -54,13 +55,53 @@ fn recorded() -> impl Strategy<Value = RecordedEpisode> {
 }
 
 fn info() -> impl Strategy<Value = ModelInfo> {
-    (name(), "[a-z-]{2,6}", digest(), vec(name(), 0..3), any::<u32>()).prop_map(
-        |(name, method, digest, training_tasks, horizon)| ModelInfo { name, method, digest, training_tasks, horizon },
+    (name(), "[a-z-]{2,6}", digest(), vec(name(), 0..3), any::<u32>(), any::<u32>()).prop_map(
+        |(name, method, digest, training_tasks, horizon, version)| ModelInfo {
+            name,
+            method,
+            digest,
+            training_tasks,
+            horizon,
+            version,
+        },
+    )
+}
+
+fn manifest() -> impl Strategy<Value = CheckpointManifest> {
+    (name(), 1u32.., digest(), any::<u64>(), digest(), vec(digest(), 0..3)).prop_map(
+        |(model, version, digest, size_bytes, config_digest, parents)| CheckpointManifest {
+            model,
+            version,
+            digest,
+            size_bytes,
+            config_digest,
+            parents,
+        },
     )
 }
 
 fn variation() -> impl Strategy<Value = Variation> {
     (name(), any::<u64>()).prop_map(|(task, seed)| Variation { task, seed })
+}
+
+fn progress() -> impl Strategy<Value = Progress> {
+    ((any::<u64>(), 1u64.., any::<u64>(), any::<u64>(), any::<u64>()), (-9.0..9.0, 0.0..1.0, 0.0..9.0, 0.0..1e6))
+        .prop_map(
+            |((step, steps, epoch, epochs, samples), (loss, learning_rate, gradient_norm, samples_per_second))| {
+                Progress { step, steps, epoch, epochs, samples, loss, learning_rate, gradient_norm, samples_per_second }
+            },
+        )
+}
+
+fn run() -> impl Strategy<Value = Run> {
+    let state = prop_oneof![
+        Just(RunState::Running),
+        digest().prop_map(|digest| RunState::Finished { digest }),
+        Just(RunState::Stopped),
+        "\\PC{0,40}".prop_map(|reason| RunState::Failed { reason }),
+        Just(RunState::Interrupted),
+    ];
+    (name(), state, option::of(progress())).prop_map(|(name, state, progress)| Run { name, state, progress })
 }
 
 fn survives<M: Message + Clone + PartialEq + std::fmt::Debug>(message: M) {
@@ -81,8 +122,9 @@ proptest! {
         observation in prop_oneof![image().prop_map(Into::into), point().prop_map(Into::into)],
         seed in any::<u64>(),
         deadline in option::of((1u64..u64::from(u32::MAX)).prop_map(Duration::from_millis)),
+        model_digest in option::of(digest()),
     ) {
-        survives(PlanRequest { model, goal, observation, seed, deadline });
+        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest });
     }
 
     #[test]
@@ -137,16 +179,13 @@ proptest! {
     }
 
     #[test]
-    fn demonstrations_and_checkpoints(
+    fn demonstrations(
         episode in recorded(),
         frame in image(),
         action in option::of(action()),
         (state, reward, success) in (vec(-9.0f32..9.0, 0..40), -9.0f32..9.0, any::<bool>()),
         step in 0..MAX_STEPS,
         missing_steps in vec(any::<u32>(), 0..5),
-        (model, digest, size_bytes) in (name(), digest(), any::<u64>()),
-        (offset_bytes, length_bytes) in (any::<u64>(), 1..=MAX_CHUNK_BYTES),
-        data in vec(any::<u8>(), 0..50),
     ) {
         let recorded = RecordedStep { step, action, state, reward, success };
         survives(recorded.clone());
@@ -155,9 +194,51 @@ proptest! {
         survives(episode.clone());
         survives(CommitEpisodeRequest { episode });
         survives(CommitEpisodeResponse { missing_steps });
-        survives(CheckpointAnnouncement { model, digest, size_bytes });
-        survives(CheckpointChunkRequest { offset_bytes, length_bytes });
+    }
+
+    #[test]
+    fn checkpoints(
+        manifest in manifest(),
+        (digest, offset_bytes, length_bytes) in (digest(), any::<u64>(), 1..=MAX_CHUNK_BYTES),
+        data in vec(any::<u8>(), 0..50),
+        versions in vec((manifest(), any::<bool>()), 0..3),
+        model in name(),
+        version in 1u32..,
+        promoted_unix_nanos in any::<u64>(),
+    ) {
+        let versions = versions.into_iter().map(|(manifest, promoted)| CheckpointVersion { manifest, promoted });
+        survives(manifest.clone());
+        survives(CheckpointAnnouncement { manifest: manifest.clone(), promoted_unix_nanos });
+        survives(CheckpointChunkRequest { digest, offset_bytes, length_bytes });
         survives(CheckpointChunkResponse { data });
+        survives(ListVersionsRequest { model: None });
+        survives(ListVersionsRequest { model: Some(model.clone()) });
+        survives(ListVersionsResponse { versions: versions.collect() });
+        survives(PromoteVersionRequest { model: model.clone(), version });
+        survives(PromoteVersionResponse { manifest: manifest.clone() });
+        survives(RollBackRequest { model });
+        survives(RollBackResponse { manifest });
+    }
+
+    #[test]
+    fn training(
+        name in name(),
+        preset in option::of(name()),
+        hold_out in vec(name(), 0..3),
+        seed in option::of(any::<u64>()),
+        settings in "\\PC{0,40}",
+        run in run(),
+        runs in vec(run(), 0..3),
+    ) {
+        survives(run.clone());
+        survives(StartRunRequest { name: name.clone(), preset, hold_out, seed, settings });
+        survives(StartRunResponse { run: run.clone() });
+        survives(StopRunRequest { name: name.clone() });
+        survives(StopRunResponse { run: run.clone() });
+        survives(ListRunsRequest);
+        survives(ListRunsResponse { runs });
+        survives(WatchRunRequest { name });
+        survives(WatchRunResponse { run });
     }
 
     #[test]
@@ -168,5 +249,9 @@ proptest! {
         let _ = decode::<DemonstrationStep>(&bytes);
         let _ = decode::<CommitEpisodeRequest>(&bytes);
         let _ = decode::<RecordedEpisode>(&bytes);
+        let _ = decode::<CheckpointAnnouncement>(&bytes);
+        let _ = decode::<ListVersionsResponse>(&bytes);
+        let _ = decode::<StartRunRequest>(&bytes);
+        let _ = decode::<Run>(&bytes);
     }
 }

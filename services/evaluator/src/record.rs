@@ -65,7 +65,7 @@ pub struct Model {
 
 impl From<ModelInfo> for Model {
     fn from(info: ModelInfo) -> Self {
-        let ModelInfo { name, method, digest, training_tasks, horizon } = info;
+        let ModelInfo { name, method, digest, training_tasks, horizon, version: _ } = info;
         Self { name, method, digest, training_tasks, horizon }
     }
 }

@@ -80,6 +80,8 @@ pub(crate) async fn attempt(
             observation: hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
+            // The one that the run began with, though the planner may swap.
+            model_digest: Some(model.digest.clone()),
         };
         let mut plan = link.plan(request(&goal)).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
@@ -88,10 +90,6 @@ pub(crate) async fn attempt(
             plan = link.plan(request(&goal)).await;
         }
         let plan = plan?;
-        if plan.model_digest != model.digest {
-            let error = Error::new(Code::FailedPrecondition, "model_digest", &model.digest, plan.model_digest);
-            return Err(Fault::Broken(error));
-        }
         log.add(&plan);
         let request = StepRequest { episode_id: reset.episode_id.clone(), step, action: plan.first_action };
         let response: StepResponse = link.call(step_key.clone(), request).await?;
@@ -244,7 +242,9 @@ mod tests {
         let count = registered.clone();
         serve(&session, key::planner_plan("p").unwrap(), move |query| {
             let request = query::request::<PlanRequest>(query).unwrap();
-            let result = if count.load(Ordering::SeqCst) < 2 {
+            let result = if request.model_digest.as_deref() != Some(DIGEST) {
+                Err(Error::new(Code::FailedPrecondition, "model_digest", DIGEST, "another"))
+            } else if count.load(Ordering::SeqCst) < 2 {
                 Err(Error::new(Code::NotFound, "goal_id", "a goal", "forgotten"))
             } else {
                 Ok(PlanResponse {
@@ -306,7 +306,7 @@ mod tests {
         assert!(
             matches!(fault("nobody", DIGEST, variation("reach", 1)).await, Fault::Broken(e) if e.code == Code::Unavailable)
         );
-        // The planner has swapped in another checkpoint.
+        // The planner does not keep the checkpoint any more.
         let other = "0".repeat(64);
         assert!(
             matches!(fault("w", &other, variation("reach", 1)).await, Fault::Broken(e) if e.field == "model_digest")

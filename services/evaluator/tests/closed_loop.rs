@@ -39,7 +39,7 @@ impl Lab {
             data_digest: "0".repeat(64),
             render_spec: String::new(),
             seed: 0,
-            epochs: 0,
+            training: cpn::Training::paper(),
         };
         let models_dir = folder.path().join("models");
         std::fs::create_dir(&models_dir).unwrap();

@@ -20,6 +20,9 @@ pub struct Config {
     pub queue_capacity: NonZeroU16,
     /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
     pub goal_capacity: NonZeroU16,
+    /// Most checkpoints of a model that are kept after they were swapped out, for episodes that began with them; the least
+    /// recently used go first.
+    pub retired_capacity: NonZeroU16,
     /// Threads libtorch uses for one plan.
     pub threads: NonZeroU16,
     /// How the planner joins the others over zenoh.
@@ -37,6 +40,7 @@ impl Default for Config {
             grpc_listen: (Ipv4Addr::LOCALHOST, 50051).into(),
             queue_capacity: count(64),
             goal_capacity: count(1024),
+            retired_capacity: count(3),
             threads: count(1),
             session: SessionConfig::default(),
         }
@@ -74,6 +78,10 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub goal_capacity: Option<NonZeroU16>,
+    /// Most checkpoints of a model that are kept after they were swapped out [default: 3].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub retired_capacity: Option<NonZeroU16>,
     /// Threads libtorch uses for one plan [default: 1].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]

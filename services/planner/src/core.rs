@@ -3,12 +3,14 @@
 use crate::config::Config;
 use crate::goals::Goals;
 use crate::model::{Model, RANDOM};
-use crate::model_thread::{ModelThread, PlanTask, unknown_model};
+use crate::model_thread::{ModelThread, PlanTask};
+use crate::served::unknown_model;
 use anyhow::Context;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tracing::{info, warn};
+use wire::checkpoint::CheckpointManifest;
 use wire::planner::{
     CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
     PlanResponse, RegisterGoalRequest, RegisterGoalResponse,
@@ -51,12 +53,14 @@ impl PlannerCore {
     /// The next actions towards the goal, by the named model. A goal that is not an id is registered on the way.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse; `NOT_FOUND` for an unknown model or goal id;
-    /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently;
+    /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse; `NOT_FOUND`
+    /// for an unknown model or goal id;
+    /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently, or the checkpoint
+    /// that must answer is not kept;
     /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline } = request;
+        let PlanRequest { model, goal, observation, seed, deadline, model_digest } = request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
         }
@@ -74,7 +78,8 @@ impl PlannerCore {
             }
             Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
-        self.thread.plan(PlanTask { model, goal_id, goal, goal_field, observation, seed, deadline }).await
+        let task = PlanTask { model, model_digest, goal_id, goal, goal_field, observation, seed, deadline };
+        self.thread.plan(task).await
     }
 
     /// Keeps a goal image; the same image gets the same id.
@@ -99,9 +104,25 @@ impl PlannerCore {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
         let folder = Arc::clone(&self.models_dir);
-        let loading = tokio::task::spawn_blocking(move || Model::load(&folder, request));
+        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request)).await? })
+    }
+
+    /// The same with a published checkpoint, whose bytes must be what its manifest says.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for a faulty checkpoint or another one, with the reason; `FAILED_PRECONDITION` for the name
+    /// `random`.
+    pub(crate) async fn load_published(&self, manifest: CheckpointManifest, bytes: Vec<u8>) -> Result<(), Error> {
+        check_replaceable(&manifest.model)?;
+        // It comes once and unasked, so that it waits where a client would be sent away.
+        let _load = self.loads.acquire().await;
+        self.swap_in(move || Model::published(manifest, &bytes)).await.map(drop)
+    }
+
+    async fn swap_in(&self, load: impl FnOnce() -> Result<Model, Error> + Send + 'static) -> Result<ModelInfo, Error> {
+        let loading = tokio::task::spawn_blocking(load);
         let model = loading.await.map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))??;
-        Ok(LoadModelResponse { model: self.serve(model).await? })
+        self.serve(model).await
     }
 
     /// Serves a method that is built already, in place of the one of its name, from the next plan on.
@@ -112,7 +133,7 @@ impl PlannerCore {
         check_replaceable(&model.info.name)?;
         let info = model.info.clone();
         self.thread.serve(model).await?;
-        info!(model = info.name, method = info.method, digest = info.digest, "serving");
+        info!(model = info.name, method = info.method, version = info.version, digest = info.digest, "serving");
         Ok(info)
     }
 

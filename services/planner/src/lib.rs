@@ -6,16 +6,18 @@
 
 pub mod config;
 pub mod core;
+mod follow;
 mod goals;
 mod grpc;
 pub mod model;
 mod model_thread;
+mod served;
 mod zenoh;
 
 use crate::core::PlannerCore;
-use crate::grpc::GrpcServer;
 use crate::zenoh::ZenohServer;
 pub use config::Config;
+use service_kit::GrpcServer;
 use std::net::SocketAddr;
 use std::time::Duration;
 use tracing::{info, warn};
@@ -39,7 +41,7 @@ pub struct Planner {
 /// If a checkpoint is faulty, an address cannot be listened on, or the name cannot stand in a key.
 pub async fn start(config: Config) -> anyhow::Result<Planner> {
     let core = PlannerCore::start(&config).await?;
-    let grpc = GrpcServer::start(core.clone(), config.grpc_listen).await?;
+    let grpc = grpc::start(core.clone(), config.grpc_listen).await?;
     let zenoh = ZenohServer::start(core.clone(), &config).await?;
     grpc.ready().await;
     info!(name = config.name, grpc = %grpc.address, "planner is ready");

@@ -1,12 +1,13 @@
 //! A model as it is served, and what is checked before it is.
 
-use cpn::checkpoint::{self, Provenance};
+use cpn::checkpoint::{self, Checkpoint, Provenance};
 use cpn::{Input, Method, Random, images, positions};
+use service_kit::files;
 use std::fmt;
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::path::Path;
 use tch::{Kind, Tensor};
+use wire::checkpoint::CheckpointManifest;
 use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo};
 use wire::{Code, Error, Observation};
 
@@ -42,7 +43,7 @@ impl Model {
         let method = Random { actions: RANDOM_ACTIONS };
         let digest = checkpoint::digest(RANDOM.as_bytes());
         Self {
-            info: info(RANDOM.to_owned(), &method, digest, Vec::new()),
+            info: info(RANDOM.to_owned(), 0, &method, digest, Vec::new()),
             render_spec: String::new(),
             method: Box::new(method),
         }
@@ -55,22 +56,44 @@ impl Model {
     pub(crate) fn load(folder: &Path, request: LoadModelRequest) -> Result<Self, Error> {
         let bytes = match request.source {
             CheckpointSource::Bytes(bytes) => bytes,
-            CheckpointSource::File(name) => read(&folder.join(&name)).map_err(|e| match e.kind() {
-                io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", name),
-                _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
-            })?,
+            // One byte more than a checkpoint may have, so that it is refused as too large.
+            CheckpointSource::File(name) => files::read_at_most(&folder.join(&name), checkpoint::MAX_BYTES + 1)
+                .map_err(|e| match e.kind() {
+                    io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", name),
+                    _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
+                })?,
         };
-        let loaded =
-            checkpoint::from_bytes(&bytes).map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
+        Self::tried(request.model, 0, read(&bytes)?)
+    }
+
+    /// Reads a published checkpoint, if the bytes are what its manifest says, and tries it once. Blocks.
+    ///
+    /// # Errors
+    /// If they are not, with the manifest's field, or for anything wrong with the checkpoint.
+    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8]) -> Result<Self, Error> {
+        let CheckpointManifest { model, version, digest, config_digest, .. } = manifest;
+        let got = checkpoint::digest(bytes);
+        if got != digest {
+            return Err(Error::invalid("digest", digest, got));
+        }
+        let loaded = read(bytes)?;
+        if loaded.config_digest != config_digest {
+            return Err(Error::invalid("config_digest", config_digest, loaded.config_digest));
+        }
+        Self::tried(model, version, loaded)
+    }
+
+    /// What a checkpoint holds, once it has planned.
+    fn tried(name: String, version: u32, loaded: Checkpoint) -> Result<Self, Error> {
         let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
-        let info = info(request.model, &loaded.agent, loaded.digest, training_tasks);
+        let info = info(name, version, &loaded.agent, loaded.digest, training_tasks);
         let model = Self { info, render_spec, method: Box::new(loaded.agent) };
         model.warm_up()?;
         Ok(model)
     }
 
-    /// Plans once, from black to white or from one corner of space to another: the first request does not pay for it, and weights that are finite but lead to
-    /// plans that are not are found out.
+    /// Plans once, from black to white or from one corner of space to another: the first request does not pay for it, and
+    /// weights that are finite but lead to plans that are not are found out.
     fn warm_up(&self) -> Result<(), Error> {
         let [x, x_g] = if self.method.takes(Input::Image) {
             [0, u8::MAX].map(|level| self.encode_bytes(&vec![level; images::BYTES]))
@@ -130,19 +153,13 @@ impl fmt::Debug for Model {
     }
 }
 
-fn info(name: String, method: &dyn Method, digest: String, training_tasks: Vec<String>) -> ModelInfo {
+fn info(name: String, version: u32, method: &dyn Method, digest: String, training_tasks: Vec<String>) -> ModelInfo {
     let horizon = u32::try_from(method.horizon()).expect("a horizon is between 1 and 64");
-    ModelInfo { name, method: method.name().to_owned(), digest, training_tasks, horizon }
+    ModelInfo { name, method: method.name().to_owned(), digest, training_tasks, horizon, version }
 }
 
-/// A regular file's bytes, one more than a checkpoint may have at most.
-fn read(path: &Path) -> io::Result<Vec<u8>> {
-    if !path.metadata()?.is_file() {
-        return Err(io::Error::other("not a regular file"));
-    }
-    let mut bytes = Vec::new();
-    File::open(path)?.take(checkpoint::MAX_BYTES as u64 + 1).read_to_end(&mut bytes)?;
-    Ok(bytes)
+fn read(bytes: &[u8]) -> Result<Checkpoint, Error> {
+    checkpoint::from_bytes(bytes).map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))
 }
 
 fn check_finite(field: &str, values: &[f32]) -> Result<(), Error> {

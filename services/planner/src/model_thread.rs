@@ -2,9 +2,10 @@
 
 use crate::config::Config;
 use crate::model::Model;
+use crate::served::Served;
 use lru::LruCache;
 use std::any::Any;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
@@ -19,6 +20,8 @@ use wire::{Code, Error, Observation};
 #[derive(Debug)]
 pub(crate) struct PlanTask {
     pub(crate) model: String,
+    /// The checkpoint that must answer.
+    pub(crate) model_digest: Option<String>,
     pub(crate) goal_id: String,
     pub(crate) goal: Arc<Observation>,
     /// The request's field that the goal came from.
@@ -74,7 +77,7 @@ impl ModelThread {
         let infos = models.iter().map(|model| (model.info.name.clone(), model.info.clone())).collect();
         let (published, subscribed) = watch::channel(infos);
         let owner = Owner {
-            models: models.into_iter().map(|model| (model.info.name.clone(), model)).collect(),
+            models: Served::new(models, config.retired_capacity.into()),
             embeddings: LruCache::new(config.goal_capacity.into()),
             published,
         };
@@ -147,7 +150,7 @@ fn too_late(deadline: Duration) -> Error {
 
 /// The thread's side.
 struct Owner {
-    models: HashMap<String, Model>,
+    models: Served,
     /// Goal embeddings `[1, Z]` by goal and checkpoint, so that those of a swapped-out model are never used.
     embeddings: LruCache<(String, String), Tensor>,
     published: watch::Sender<BTreeMap<String, ModelInfo>>,
@@ -166,7 +169,7 @@ impl Owner {
                 }
                 Job::Serve { model, reply } => {
                     let (name, info) = (model.info.name.clone(), model.info.clone());
-                    self.models.insert(name.clone(), model);
+                    self.models.swap_in(model);
                     self.published.send_modify(|infos| drop(infos.insert(name, info)));
                     let _ = reply.send(());
                 }
@@ -191,7 +194,7 @@ impl Owner {
     }
 
     fn plan(&mut self, task: &PlanTask) -> Result<PlanResponse, Error> {
-        let model = self.models.get(&task.model).ok_or_else(|| unknown_model(&task.model, self.models.keys()))?;
+        let model = self.models.get(&task.model, task.model_digest.as_deref())?;
         model.check_takes(task.goal_field, &task.goal)?;
         model.check_takes(task.observation_field(), &task.observation)?;
         check_render_specs(task, &model.render_spec)?;
@@ -231,13 +234,6 @@ fn check_render_specs(task: &PlanTask, model: &str) -> Result<(), Error> {
         }
     }
     Ok(())
-}
-
-/// The named model is not among those served.
-pub(crate) fn unknown_model<'a>(name: &str, served: impl Iterator<Item = &'a String>) -> Error {
-    let mut served: Vec<_> = served.map(String::as_str).collect();
-    served.sort_unstable();
-    Error::new(Code::NotFound, "model", format!("one of {}", served.join(", ")), name)
 }
 
 /// What a panic says; `tch` panics with the message of libtorch.

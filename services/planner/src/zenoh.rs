@@ -2,19 +2,17 @@
 
 use crate::config::Config;
 use crate::core::PlannerCore;
+use crate::follow::Follower;
 use crate::model_thread::queue_full;
 use anyhow::{anyhow, ensure};
-use backon::{ConstantBuilder, Retryable};
 use std::future::{Future, ready};
 use std::sync::Arc;
-use std::time::Duration;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::{AbortOnDropHandle, TaskTracker};
-use tracing::{info, warn};
-use wire::checkpoint::{CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse, MAX_CHUNK_BYTES};
-use wire::planner::{CheckpointSource, ListModelsRequest, LoadModelRequest};
-use wire::{Code, Error, Message, key, query};
+use tracing::warn;
+use wire::planner::ListModelsRequest;
+use wire::{Error, Message, key, query};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
@@ -23,8 +21,6 @@ use zenoh::query::{Query, Queryable};
 
 /// Announcements that wait while a checkpoint is fetched; the oldest go first.
 const ANNOUNCEMENTS: usize = 64;
-/// How long one piece of a checkpoint may take.
-const CHUNK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The planner's place in the zenoh network.
 #[derive(Debug)]
@@ -77,13 +73,12 @@ impl ZenohServer {
             .with(RingChannel::new(ANNOUNCEMENTS))
             .await
             .map_err(|e| anyhow!(e))?;
-        let fetching = session.clone();
+        let mut follower = Follower::new(session.clone(), core);
         let announcements = AbortOnDropHandle::new(tokio::spawn(async move {
             while let Ok(sample) = subscriber.recv_async().await {
-                let key = sample.key_expr();
-                match follow(&fetching, &core, &sample.payload().to_bytes()).await {
-                    Ok(announcement) => info!(%key, digest = announcement.digest, "announced checkpoint is served"),
-                    Err(error) => warn!(%key, %error, "announced checkpoint refused; the old one serves on"),
+                if let Err(error) = follower.follow(&sample.payload().to_bytes()).await {
+                    let key = sample.key_expr();
+                    warn!(%key, %error, "announced checkpoint refused; the old one serves on");
                 }
             }
         }));
@@ -156,59 +151,4 @@ impl Requests {
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }
-}
-
-/// Fetches and serves what a message announces, unless it is served already.
-async fn follow(session: &Session, core: &PlannerCore, message: &[u8]) -> Result<CheckpointAnnouncement, Error> {
-    let announcement: CheckpointAnnouncement = wire::decode(message)?;
-    let served = core.list_models().models;
-    if !served.iter().any(|info| info.name == announcement.model && info.digest == announcement.digest) {
-        let bytes = fetch(session, &announcement).await?;
-        let source = CheckpointSource::Bytes(bytes);
-        core.load_model(LoadModelRequest { model: announcement.model.clone(), source }).await?;
-    }
-    Ok(announcement)
-}
-
-/// An announced checkpoint's bytes, piece by piece.
-async fn fetch(session: &Session, announcement: &CheckpointAnnouncement) -> Result<Vec<u8>, Error> {
-    let CheckpointAnnouncement { digest, size_bytes, .. } = announcement;
-    let size = usize::try_from(*size_bytes).unwrap_or(usize::MAX);
-    if size > cpn::checkpoint::MAX_BYTES {
-        let limit = format!("at most {}", cpn::checkpoint::MAX_BYTES);
-        return Err(Error::invalid("size_bytes", limit, size_bytes));
-    }
-    let key = key::checkpoint_chunk(digest)?;
-    let mut bytes = Vec::with_capacity(size);
-    while bytes.len() < size {
-        let length_bytes = u32::try_from(size - bytes.len()).unwrap_or(u32::MAX).min(MAX_CHUNK_BYTES);
-        let request = CheckpointChunkRequest { offset_bytes: bytes.len() as u64, length_bytes };
-        let chunk = fetch_chunk(session, &key, &request).await?;
-        if chunk.len() != length_bytes as usize {
-            return Err(Error::invalid("data", format!("{length_bytes} bytes"), format!("{} bytes", chunk.len())));
-        }
-        bytes.extend(chunk);
-    }
-    let hashing = tokio::task::spawn_blocking(|| (cpn::checkpoint::digest(&bytes), bytes));
-    let (got, bytes) = hashing.await.map_err(|e| Error::new(Code::Internal, "digest", "a digest", e))?;
-    if got != *digest {
-        return Err(Error::invalid("digest", digest, got));
-    }
-    Ok(bytes)
-}
-
-/// When to ask for a piece again: right after a reconnect a query can end without an answer.
-fn again() -> ConstantBuilder {
-    ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(2)
-}
-
-async fn fetch_chunk(
-    session: &Session,
-    key: &OwnedKeyExpr,
-    request: &CheckpointChunkRequest,
-) -> Result<Vec<u8>, Error> {
-    let ask = || query::call(session, key, request.clone(), CHUNK_TIMEOUT);
-    let answer: CheckpointChunkResponse =
-        ask.retry(again()).when(|error: &Error| error.code == Code::Unavailable).await?;
-    Ok(answer.data)
 }

@@ -4,16 +4,17 @@
 
 mod common;
 
-use common::{Client, Fixture, checkpoint, from_bytes, from_file, plan_request, soon};
+use common::{Client, Fixture, checkpoint, from_bytes, from_file, is, plan_request, soon};
 use cpn::MethodKind;
 use cpn::archive::{self, Tensors};
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 use tokio::task::JoinSet;
-use wire::checkpoint::{CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse};
-use wire::{key, query};
+use wire::checkpoint::{CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse, CheckpointManifest};
+use wire::proto::PlanRequest;
+use wire::{Code, key, query};
 use zenoh::Session;
 use zenoh::query::Queryable;
 
@@ -112,9 +113,41 @@ async fn plans_and_swaps_do_not_mix() {
     }
 }
 
-/// Serves `bytes` as every checkpoint that is asked for.
-async fn publish(session: &Session, bytes: Vec<u8>) -> Queryable<()> {
+/// Who names the checkpoint that must answer gets its plans after it was swapped out, for as long as it is kept.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_episode_ends_with_the_checkpoint_it_began_with() {
+    let fixture = Fixture::start(&[("cpn", cpn(0))], |config| config.retired_capacity = 2.try_into().unwrap()).await;
+    let pinned = |digest: &str| PlanRequest { model_digest: digest.into(), ..plan_request("cpn", 5) };
+    let digests = [0, 1, 2, 3, 4].map(|seed| cpn::checkpoint::digest(&cpn(seed)));
+    let [swapper, ..] = fixture.clients();
+    let first = swapper.plan(plan_request("cpn", 5)).await.unwrap();
+    assert_eq!(first.model_digest, digests[0]);
+    for swap in 1..=3 {
+        swapper.load_model(from_bytes("cpn", cpn(swap))).await.unwrap();
+        for client in fixture.clients() {
+            let plan = client.plan(pinned(&digests[0])).await.unwrap();
+            assert_eq!((&plan.model_digest, &plan.actions), (&digests[0], &first.actions), "{}", client.transport());
+            assert_eq!(client.digest("cpn").await, digests[swap as usize]);
+        }
+    }
+    // Nobody asked for this one, so that it went first.
+    is(Code::FailedPrecondition, "model_digest", swapper.plan(pinned(&digests[1])).await);
+    swapper.load_model(from_bytes("cpn", cpn(4))).await.unwrap();
+    swapper.load_model(from_bytes("cpn", cpn(2))).await.unwrap();
+    for client in fixture.clients() {
+        is(Code::FailedPrecondition, "model_digest", client.plan(pinned(&digests[0])).await);
+        let elsewhere = PlanRequest { model: "random".into(), ..pinned(&digests[2]) };
+        is(Code::FailedPrecondition, "model_digest", client.plan(elsewhere).await);
+        for digest in &digests[2..] {
+            assert_eq!(client.plan(pinned(digest)).await.unwrap().model_digest, *digest);
+        }
+    }
+}
+
+/// Serves bytes by the digest they are asked for with, be it theirs or not.
+async fn publish<const N: usize>(session: &Session, bytes: [(&str, &[u8]); N]) -> Queryable<()> {
     let runtime = tokio::runtime::Handle::current();
+    let bytes: HashMap<_, _> = bytes.into_iter().map(|(digest, bytes)| (digest.to_owned(), bytes.to_vec())).collect();
     let bytes = Arc::new(bytes);
     session
         .declare_queryable(key::checkpoint_chunk("*").unwrap())
@@ -123,6 +156,7 @@ async fn publish(session: &Session, bytes: Vec<u8>) -> Queryable<()> {
             let bytes = Arc::clone(&bytes);
             runtime.spawn(async move {
                 let chunk = query::request(&query).map(|request: CheckpointChunkRequest| {
+                    let bytes = &bytes[&request.digest];
                     let start = bytes.len().min(request.offset_bytes as usize);
                     let end = bytes.len().min(start + request.length_bytes as usize);
                     CheckpointChunkResponse { data: bytes[start..end].to_vec() }
@@ -134,23 +168,44 @@ async fn publish(session: &Session, bytes: Vec<u8>) -> Queryable<()> {
         .unwrap()
 }
 
-async fn announce(session: &Session, model: &str, digest: String, size_bytes: u64) {
-    let announcement = CheckpointAnnouncement { model: model.into(), digest, size_bytes };
-    session.put(key::checkpoint_announcement(model).unwrap(), wire::encode(announcement)).await.unwrap();
+/// What is to be said of a checkpoint.
+fn manifest(model: &str, version: u32, bytes: &[u8]) -> CheckpointManifest {
+    let loaded = cpn::checkpoint::from_bytes(bytes).unwrap();
+    CheckpointManifest {
+        model: model.into(),
+        version,
+        parents: loaded.parents(),
+        digest: loaded.digest,
+        size_bytes: bytes.len() as u64,
+        config_digest: loaded.config_digest,
+    }
 }
 
-/// Waits until the planner serves a model with this digest.
-async fn served(client: &Client, model: &str, digest: &str) {
+async fn announce(session: &Session, manifest: CheckpointManifest, promoted_unix_nanos: u64) {
+    let key = key::checkpoint_announcement(&manifest.model).unwrap();
+    session.put(key, wire::encode(CheckpointAnnouncement { manifest, promoted_unix_nanos })).await.unwrap();
+}
+
+/// Waits until the planner serves what a manifest says.
+async fn served(client: &Client, CheckpointManifest { model, version, digest, .. }: &CheckpointManifest) {
     let poll = async {
         loop {
             let models = client.list_models().await.unwrap().models;
-            if models.iter().any(|info| info.name == model && info.digest == digest) {
+            if models.iter().any(|info| (&info.name, &info.version, &info.digest) == (model, version, digest)) {
                 return;
             }
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
     soon(poll).await;
+}
+
+/// Waits until the planner has dealt with everything that was announced before.
+async fn all_is_heeded(fixture: &Fixture, client: &Client, bytes: &[u8]) {
+    static MARKERS: AtomicU32 = AtomicU32::new(1);
+    let marker = manifest("marker", MARKERS.fetch_add(1, Ordering::Relaxed), bytes);
+    announce(&fixture.session, marker.clone(), marker.version.into()).await;
+    served(client, &marker).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -161,39 +216,105 @@ async fn an_announced_checkpoint_is_fetched() {
     let large = cpn::Agent::new(cpn::ModelConfig::paper(MethodKind::TeBc), 4);
     let provenance = cpn::checkpoint::Provenance {
         training_tasks: vec![],
-        data_digest: "d".into(),
+        data_digest: "d".repeat(64),
         render_spec: String::new(),
         seed: 4,
-        epochs: 0,
+        training: cpn::Training::paper(),
     };
     let bytes = cpn::checkpoint::to_bytes(&large, &provenance).unwrap();
     assert!(bytes.len() > 2 * wire::checkpoint::MAX_CHUNK_BYTES as usize);
-    let digest = cpn::checkpoint::digest(&bytes);
-    let size = bytes.len() as u64;
-    let _publisher = publish(&fixture.session, bytes).await;
-    announce(&fixture.session, "cpn", digest.clone(), size).await;
-    served(&client, "cpn", &digest).await;
-    assert_eq!(client.digest("cpn").await, digest);
+    let manifest = manifest("cpn", 3, &bytes);
+    let _publisher = publish(&fixture.session, [(&manifest.digest, &bytes)]).await;
+    announce(&fixture.session, manifest.clone(), 1).await;
+    served(&client, &manifest).await;
+    assert_eq!(client.digest("cpn").await, manifest.digest);
 }
 
-/// Each false announcement is followed by a true one for another model: once that is served, the false one was refused.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_checkpoint_that_is_not_what_was_announced_is_refused() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let [client, ..] = fixture.clients();
-    let before = client.digest("cpn").await;
+    let before = client.list_models().await.unwrap();
     let bytes = cpn(2);
-    let (digest, size) = (cpn::checkpoint::digest(&bytes), bytes.len() as u64);
-    let _publisher = publish(&fixture.session, bytes).await;
-    let other = cpn::checkpoint::digest(b"something else");
-    announce(&fixture.session, "cpn", other, size).await;
-    announce(&fixture.session, "cpn", digest.clone(), size + 1).await;
-    announce(&fixture.session, "cpn", digest.clone(), size - 1).await;
-    announce(&fixture.session, "cpn", digest.clone(), u64::MAX).await;
-    announce(&fixture.session, "random", digest.clone(), size).await;
+    let good = manifest("cpn", 1, &bytes);
+    let (size_bytes, other) = (good.size_bytes, cpn::checkpoint::digest(b"something else"));
+    let _publisher = publish(&fixture.session, [(&good.digest, &bytes), (&other, &bytes)]).await;
+    for manifest in [
+        CheckpointManifest { digest: other.clone(), ..good.clone() },
+        CheckpointManifest { config_digest: other, ..good.clone() },
+        CheckpointManifest { size_bytes: size_bytes + 1, ..good.clone() },
+        CheckpointManifest { size_bytes: size_bytes - 1, ..good.clone() },
+        CheckpointManifest { size_bytes: u64::MAX, ..good.clone() },
+        CheckpointManifest { model: "random".into(), ..good.clone() },
+    ] {
+        announce(&fixture.session, manifest, 9).await;
+    }
     let noise = vec![0xff; 7];
     fixture.session.put(key::checkpoint_announcement("cpn").unwrap(), noise).await.unwrap();
-    announce(&fixture.session, "honest", digest.clone(), size).await;
-    served(&client, "honest", &digest).await;
-    assert_eq!(client.digest("cpn").await, before);
+    all_is_heeded(&fixture, &client, &bytes).await;
+    let mut after = client.list_models().await.unwrap();
+    after.models.retain(|info| info.name != "marker");
+    assert_eq!(after, before);
+    // What was refused keeps nothing away, though it was promoted later.
+    announce(&fixture.session, good.clone(), 1).await;
+    served(&client, &good).await;
+}
+
+/// What a trainer serves is wrong in spite of a right manifest.
+#[tokio::test(flavor = "multi_thread")]
+async fn corrupt_and_truncated_pieces_are_refused() {
+    let bytes = cpn(2);
+    let mut corrupt = bytes.clone();
+    corrupt[bytes.len() / 2] ^= 1;
+    let mut longer = bytes.clone();
+    longer.push(0);
+    let faulty = spoiled(|tensors, _| drop(tensors.remove("step_size")));
+    let missing = CheckpointManifest {
+        digest: cpn::checkpoint::digest(&faulty),
+        size_bytes: faulty.len() as u64,
+        ..manifest("cpn", 1, &bytes)
+    };
+    for (manifest, served) in [
+        (manifest("cpn", 1, &bytes), corrupt),
+        (manifest("cpn", 1, &bytes), bytes[..bytes.len() - 1].to_vec()),
+        (manifest("cpn", 1, &bytes), Vec::new()),
+        (CheckpointManifest { size_bytes: longer.len() as u64, ..manifest("cpn", 1, &bytes) }, longer),
+        (missing, faulty),
+    ] {
+        let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
+        let [client, ..] = fixture.clients();
+        let before = client.digest("cpn").await;
+        let marker = cpn(3);
+        let served = [(&*manifest.digest, &*served), (&cpn::checkpoint::digest(&marker), &marker)];
+        let _publisher = publish(&fixture.session, served).await;
+        announce(&fixture.session, manifest, 1).await;
+        all_is_heeded(&fixture, &client, &marker).await;
+        assert_eq!(client.digest("cpn").await, before);
+    }
+}
+
+/// A roll-back announces an older version, a trainer repeats what it said, and messages come late: what was promoted last
+/// is served, in whatever order it is heard.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_promoted_last_is_served() {
+    let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
+    let [client, ..] = fixture.clients();
+    let bytes = cpn(2);
+    let _publisher = publish(&fixture.session, [(&cpn::checkpoint::digest(&bytes), &bytes)]).await;
+    let version = |number| manifest("cpn", number, &bytes);
+    // Each is announced with when it was promoted; expected is what is served then.
+    for (number, promoted, expected) in
+        [(1, 10, 1), (2, 20, 2), (1, 10, 2), (1, 30, 1), (2, 20, 1), (1, 30, 1), (3, 29, 1)]
+    {
+        announce(&fixture.session, version(number), promoted).await;
+        all_is_heeded(&fixture, &client, &bytes).await;
+        served(&client, &version(expected)).await;
+    }
+    // A model that somebody loads stays until another is promoted.
+    client.load_model(from_bytes("cpn", cpn(3))).await.unwrap();
+    announce(&fixture.session, version(1), 30).await;
+    all_is_heeded(&fixture, &client, &bytes).await;
+    assert_eq!(client.digest("cpn").await, cpn::checkpoint::digest(&cpn(3)));
+    announce(&fixture.session, version(1), 31).await;
+    served(&client, &version(1)).await;
 }

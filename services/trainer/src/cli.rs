@@ -3,6 +3,8 @@
 use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 use service_kit::SessionConfig;
+use std::net::SocketAddr;
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 
 /// Take in demonstrations, train the learned methods, publish checkpoints.
@@ -15,16 +17,32 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Keep the episodes of demonstration streams and publish the checkpoints of a folder.
+    /// Keep the episodes of demonstration streams, publish the checkpoints of a folder, and run training when asked to.
     Serve(ServeArgs),
-    /// Train a method; the same command goes on where an interrupted one stopped.
+    /// Train a model; the same command goes on where an interrupted one stopped.
     Train(TrainArgs),
+    /// Print all settings of a preset, as a file that `train --config` takes.
+    Preset(PresetArgs),
+    /// Start a training run of a trainer that serves, or take up one.
+    Start(StartArgs),
+    /// Let a training run save its state and end.
+    Stop(StopArgs),
+    /// List the training runs.
+    Runs(RunsArgs),
+    /// Show the progress of a training run until it ends.
+    Watch(WatchArgs),
     /// Send recordings to a recorder, as the workers did.
     Replay(ReplayArgs),
     /// Fetch what another recorder keeps, then follow it.
     Mirror(MirrorArgs),
     /// Read every recording and report what is in them and what is wrong.
     Verify(VerifyArgs),
+    /// List the published versions that a trainer keeps.
+    Versions(VersionsArgs),
+    /// Let planners serve a version that is kept.
+    Promote(PromoteArgs),
+    /// Let planners serve the version that was promoted before.
+    Rollback(RollbackArgs),
 }
 
 /// What was typed; what was not is left to the environment, the file and the defaults.
@@ -34,6 +52,10 @@ pub struct ServeArgs {
     #[arg(long)]
     #[serde(skip)]
     pub config: Option<PathBuf>,
+    /// Name of the trainer in its zenoh keys [default: trainer].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
     /// Where episodes are kept.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -42,6 +64,26 @@ pub struct ServeArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     checkpoints: Option<PathBuf>,
+    /// Versions of a model that are kept.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    keep_versions: Option<NonZeroU16>,
+    /// Folder of the training runs' folders [default: runs/training].
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    runs: Option<PathBuf>,
+    /// Most training runs at the same time [default: 1].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    max_runs: Option<NonZeroU16>,
+    /// Where gRPC listens [default: 127.0.0.1:50052].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    grpc_listen: Option<SocketAddr>,
+    /// Where Prometheus finds metrics, for example 127.0.0.1:9464 [default: nowhere].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    metrics_listen: Option<SocketAddr>,
     #[command(flatten)]
     session: SessionConfig,
 }
@@ -61,50 +103,105 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// Method to train: bc, te-bc, upn or cpn.
+    /// What to train: paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn or jenga [default: cpn].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
-    method: Option<String>,
-    /// What observations and goals are: image or position.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    input: Option<String>,
-    /// Planned steps.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    horizon: Option<i64>,
-    /// Gradient updates of a plan.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    updates: Option<i64>,
-    /// Share of the goals that are told in hindsight, of positions.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    hindsight: Option<f64>,
-    /// Encoder of images to train it with: paper or upn.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    encoder: Option<String>,
+    preset: Option<String>,
     /// Tasks that the model must not see.
     #[arg(long, value_delimiter = ',')]
     #[serde(skip_serializing_if = "Option::is_none")]
     hold_out: Option<Vec<String>>,
-    /// Passes over every frame.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    epochs: Option<u32>,
-    /// Samples of a step.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    batch_size: Option<usize>,
     /// Seed of initialisation and sampling.
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     seed: Option<u64>,
-    /// Threads of libtorch.
+    /// Threads that compute [default: 1].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
-    threads: Option<i32>,
+    threads: Option<usize>,
+    /// How often the run saves its state [default: 60].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    save_interval_seconds: Option<f64>,
+    /// Where the run keeps its progress, events and curve [default: runs/training/ and the name of the checkpoint].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    run_dir: Option<PathBuf>,
+    /// Change any setting that `cpn-trainer preset` shows, for example training.epochs=8.
+    #[arg(long, value_name = "KEY=VALUE")]
+    #[serde(skip)]
+    pub set: Vec<String>,
+    /// Print progress as lines of JSON instead of a bar.
+    #[arg(long)]
+    #[serde(skip)]
+    pub json: bool,
+}
+
+/// Which trainer is asked.
+#[derive(Debug, Args)]
+pub struct TrainerArgs {
+    /// Name of the trainer.
+    #[arg(long, default_value = "trainer")]
+    pub trainer: String,
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct PresetArgs {
+    /// One of paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn, jenga.
+    #[arg(default_value = "cpn")]
+    pub name: String,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct StartArgs {
+    /// Name of the run and of its checkpoint.
+    pub name: String,
+    /// Where the settings start from.
+    #[arg(long)]
+    pub preset: Option<String>,
+    /// Tasks that the model must not see.
+    #[arg(long, value_delimiter = ',')]
+    pub hold_out: Vec<String>,
+    /// Seed of initialisation and sampling.
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// A further setting of `train`, in TOML: --set epochs=50, for example.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+    #[command(flatten)]
+    pub trainer: TrainerArgs,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct StopArgs {
+    /// Name of the run.
+    pub name: String,
+    #[command(flatten)]
+    pub trainer: TrainerArgs,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct RunsArgs {
+    /// Print JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub trainer: TrainerArgs,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct WatchArgs {
+    /// Name of the run.
+    pub name: String,
+    #[command(flatten)]
+    pub trainer: TrainerArgs,
 }
 
 /// What was typed.
@@ -148,4 +245,36 @@ pub struct VerifyArgs {
     /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct VersionsArgs {
+    /// The model whose versions to list; all if none is given.
+    pub model: Option<String>,
+    /// Print JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct PromoteArgs {
+    /// Name of the model.
+    pub model: String,
+    /// The version to serve.
+    pub version: u32,
+    #[command(flatten)]
+    pub session: SessionConfig,
+}
+
+/// What was typed.
+#[derive(Debug, Args)]
+pub struct RollbackArgs {
+    /// Name of the model.
+    pub model: String,
+    #[command(flatten)]
+    pub session: SessionConfig,
 }

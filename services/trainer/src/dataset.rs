@@ -1,143 +1,204 @@
-//! The demonstrations of a training run, in memory.
+//! The demonstrations of a training run, in memory: every frame as bytes or as a position, side by side.
 
-use crate::episode::Episode;
-use crate::recordings::{self, dataset_digest, tasks_of};
-use crate::train::Demonstrations;
+use crate::frame;
+use crate::recordings::{self, dataset_digest};
 use anyhow::{Context, ensure};
-use rand::SeedableRng;
-use rand::seq::SliceRandom;
-use rand_chacha::ChaCha8Rng;
-use std::path::Path;
-use tch::{Device, Kind, Tensor};
+use cpn::{Input, images};
+use rayon::prelude::*;
+use recording::Episode as Recording;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use wire::Error;
 use wire::demonstration::RecordedEpisode;
 
-/// Every frame with an action, of every episode that is not held out.
+/// Every frame and action of every episode that is not held out.
 #[derive(Debug)]
 pub struct Dataset {
+    frames: Frames,
+    /// `[actions, A]`, episode after episode.
+    actions: Vec<f32>,
+    action_size: usize,
     episodes: Vec<Episode>,
-    samples: Vec<Sample>,
     infos: Vec<RecordedEpisode>,
-    render_spec: String,
     digest: String,
 }
 
-/// A moment of an episode.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Sample {
-    episode: usize,
-    step: usize,
+/// What was observed, episode after episode.
+#[derive(Debug)]
+pub enum Frames {
+    /// Camera images, `[frames, 84, 84, 3]`.
+    Pixels(Vec<u8>),
+    /// Positions of the hand, in metres. The last of an episode is where it was to go, which is only ever a goal.
+    Positions(Vec<[f32; 3]>),
 }
 
-/// The tensors of a training step.
-#[derive(Debug)]
-pub struct Batch {
-    /// `[B, 84, 84, 3]` bytes, or `[B, 3]` metres.
-    pub observations: Tensor,
-    /// The last frames of the same episodes, or where they were to go; like the observations.
-    pub goals: Tensor,
-    /// The actions that follow, `[B, H, A]`; 0 past the end.
-    pub actions: Tensor,
-    /// 1 where there is an action, `[B, H]`.
-    pub mask: Tensor,
+/// Where an episode lies: T actions, and T + 1 frames before, between and after them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Episode {
+    /// Its first frame among all.
+    pub first_frame: usize,
+    /// Its first action among all.
+    pub first_action: usize,
+    /// T.
+    pub action_count: usize,
 }
 
 impl Dataset {
-    /// Reads every episode of `folder` but those of the `held_out` tasks.
+    /// Reads every episode of `folder` but those of the `held_out` tasks, as images or as positions.
     ///
     /// # Errors
-    /// If a recording is damaged, the episodes differ in the size of their actions or in how they were rendered, none is
-    /// left, or a held-out task has none, which is more likely a slip of the pen than meant.
-    pub fn load(folder: &Path, held_out: &[String]) -> anyhow::Result<Self> {
+    /// If a recording is damaged or has no positions where these are asked for, the episodes differ in the size of their
+    /// actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
+    /// pen than meant.
+    pub fn load(folder: &Path, held_out: &[String], input: Input) -> anyhow::Result<Self> {
         let all_tasks = recordings::tasks(folder)?;
         for task in held_out {
             ensure!(all_tasks.contains(task), "hold_out: expected some of {all_tasks:?}, got {task:?}");
         }
-        let mut dataset = Self {
-            episodes: Vec::new(),
-            samples: Vec::new(),
-            infos: Vec::new(),
-            render_spec: String::new(),
-            digest: String::new(),
-        };
         let held_out: Vec<_> = held_out.iter().map(|task| folder.join(task)).collect();
-        for path in recordings::paths(folder)? {
-            if !held_out.iter().any(|task| path.starts_with(task)) {
-                let episode = recordings::read(folder, &path)?;
-                dataset.push(&episode).with_context(|| path.display().to_string())?;
+        let mut paths = recordings::paths(folder)?;
+        paths.retain(|path| !held_out.iter().any(|task| path.starts_with(task)));
+        ensure!(!paths.is_empty(), "{}: expected demonstrations, got none", folder.display());
+        // The headers tell how much room everything takes; then each core fills in episodes.
+        let infos = paths.par_iter().map(|path| header(path)).collect::<anyhow::Result<Vec<_>>>()?;
+        let (mut episodes, mut count) = (Vec::with_capacity(infos.len()), 0);
+        for (path, info) in paths.iter().zip(&infos) {
+            let (expected, got) = (&infos[0].render_spec, &info.render_spec);
+            let path = path.display();
+            ensure!(
+                expected == got,
+                "{path}: render_spec: expected {expected:?} like the episodes before, got {got:?}"
+            );
+            let action_count = info.steps as usize - 1;
+            episodes.push(Episode { first_frame: count, first_action: count - episodes.len(), action_count });
+            count += action_count + 1;
+        }
+        let (frames, read) = match input {
+            Input::Image => {
+                let mut pixels = vec![0; count * images::BYTES];
+                let read = fill(slots(&mut pixels, images::BYTES, &episodes), folder, &paths, copy_pixels)?;
+                (Frames::Pixels(pixels), read)
             }
+            Input::Position => {
+                let mut positions = vec![[0.0; 3]; count];
+                let read = fill(slots(&mut positions, 1, &episodes), folder, &paths, copy_positions)?;
+                (Frames::Positions(positions), read)
+            }
+        };
+        let action_size = read[0].1;
+        for ((_, got), path) in read.iter().zip(&paths) {
+            let path = path.display();
+            ensure!(
+                action_size == *got,
+                "{path}: actions: expected {action_size} values like the episodes before, got {got}"
+            );
         }
-        ensure!(!dataset.episodes.is_empty(), "{}: expected demonstrations, got none", folder.display());
-        dataset.digest = dataset_digest(&dataset.infos);
-        Ok(dataset)
+        let actions = read.into_iter().flat_map(|(actions, _)| actions).collect();
+        let digest = dataset_digest(&infos);
+        Ok(Self { frames, actions, action_size, episodes, infos, digest })
     }
 
-    fn push(&mut self, recording: &recording::Episode) -> anyhow::Result<()> {
-        let episode = Episode::from_recording(recording)?;
-        if let Some(first) = self.episodes.first() {
-            let (expected, got) = (first.actions.size()[1], episode.actions.size()[1]);
-            ensure!(expected == got, "actions: expected {expected} values like the episodes before, got {got}");
-            let (expected, got) = (&self.render_spec, &recording.info().render_spec);
-            ensure!(expected == got, "render_spec: expected {expected:?} like the episodes before, got {got:?}");
+    /// Names of the tasks, in order.
+    pub fn tasks(&self) -> BTreeSet<&str> {
+        self.infos.iter().map(|info| info.variation.task.as_str()).collect()
+    }
+
+    /// How every frame was rendered; empty for those of a real camera and for positions.
+    pub fn render_spec(&self) -> &str {
+        match self.frames {
+            Frames::Pixels(_) => &self.infos[0].render_spec,
+            Frames::Positions(_) => "",
         }
-        self.render_spec.clone_from(&recording.info().render_spec);
-        let index = self.episodes.len();
-        self.samples.extend((0..episode.action_count()).map(|step| Sample { episode: index, step }));
-        self.episodes.push(episode);
-        self.infos.push(recording.info().clone());
-        Ok(())
-    }
-}
-
-impl Demonstrations for Dataset {
-    type Sample = Sample;
-
-    fn tasks(&self) -> Vec<String> {
-        tasks_of(&self.infos)
     }
 
-    fn render_spec(&self) -> &str {
-        &self.render_spec
+    /// The episodes, in the order of their files.
+    pub fn episodes(&self) -> &[Episode] {
+        &self.episodes
     }
 
-    fn episode_count(&self) -> usize {
-        self.episodes.len()
+    /// Number of frames with an action.
+    pub fn sample_count(&self) -> usize {
+        self.episodes.iter().map(|episode| episode.action_count).sum()
     }
 
-    fn sample_count(&self) -> usize {
-        self.samples.len()
+    /// A, the size of an action.
+    pub fn action_size(&self) -> usize {
+        self.action_size
     }
 
-    fn action_size(&self) -> i64 {
-        self.episodes[0].actions.size()[1]
-    }
-
-    fn digest(&self) -> &str {
+    /// What [`dataset_digest`] gives for the episodes.
+    pub fn digest(&self) -> &str {
         &self.digest
     }
 
-    fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Sample> {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(epoch);
-        let mut samples = self.samples.clone();
-        samples.shuffle(&mut rng);
-        samples
+    /// What was observed.
+    pub fn frames(&self) -> &Frames {
+        &self.frames
     }
 
-    fn batch(&self, samples: &[Sample], horizon: i64) -> Batch {
-        let options = (Kind::Float, Device::Cpu);
-        let size = samples.len() as i64;
-        let actions = Tensor::zeros([size, horizon, self.action_size()], options);
-        let mask = Tensor::zeros([size, horizon], options);
-        let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
-        for (row, sample) in samples.iter().enumerate() {
-            let episode = &self.episodes[sample.episode];
-            let (row, step, length) = (row as i64, sample.step as i64, episode.action_count() as i64);
-            observations.push(episode.frames.get(step));
-            goals.push(episode.frames.get(length));
-            let known = horizon.min(length - step);
-            actions.get(row).narrow(0, 0, known).copy_(&episode.actions.narrow(0, step, known));
-            let _ = mask.get(row).narrow(0, 0, known).fill_(1.0);
-        }
-        Batch { observations: Tensor::stack(&observations, 0), goals: Tensor::stack(&goals, 0), actions, mask }
+    /// The actions `[count, A]` from one on.
+    pub fn actions(&self, first: usize, count: usize) -> &[f32] {
+        &self.actions[first * self.action_size..][..count * self.action_size]
     }
+}
+
+fn header(path: &PathBuf) -> anyhow::Result<RecordedEpisode> {
+    let info = recording::read_header(path).with_context(|| path.display().to_string())?;
+    ensure!(info.steps >= 2, "{}: steps: expected at least 2, got {}", path.display(), info.steps);
+    Ok(info)
+}
+
+/// Cuts the frames, `size` values each, into those of each episode.
+fn slots<'a, T>(mut frames: &'a mut [T], size: usize, episodes: &[Episode]) -> Vec<&'a mut [T]> {
+    let cut = |episode: &Episode| {
+        let (slot, rest) = std::mem::take(&mut frames).split_at_mut((episode.action_count + 1) * size);
+        frames = rest;
+        slot
+    };
+    episodes.iter().map(cut).collect()
+}
+
+/// Lets `copy` put each episode's frames into its slot; answers its actions `[T, A]` and A.
+fn fill<T: Send>(
+    slots: Vec<&mut [T]>,
+    folder: &Path,
+    paths: &[PathBuf],
+    copy: impl Fn(&Recording, &mut [T]) -> anyhow::Result<()> + Sync,
+) -> anyhow::Result<Vec<(Vec<f32>, usize)>> {
+    let read = |(slot, path): (&mut [T], &PathBuf)| {
+        let episode = recordings::read(folder, path)?;
+        copy(&episode, slot).with_context(|| path.display().to_string())?;
+        let actions: Vec<f32> = episode.steps().iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
+        let size = actions.len() / (episode.steps().len() - 1);
+        Ok((actions, size))
+    };
+    slots.into_par_iter().zip(paths).map(read).collect()
+}
+
+fn copy_pixels(episode: &Recording, slot: &mut [u8]) -> anyhow::Result<()> {
+    check_count(slot.len() / images::BYTES, episode)?;
+    for (place, step) in slot.chunks_exact_mut(images::BYTES).zip(episode.steps()) {
+        frame::check(step)?;
+        place.copy_from_slice(step.frame.data());
+    }
+    Ok(())
+}
+
+fn copy_positions(episode: &Recording, slot: &mut [[f32; 3]]) -> anyhow::Result<()> {
+    check_count(slot.len(), episode)?;
+    let position = |values: &[f32], field: String, expected| {
+        values.first_chunk().copied().ok_or_else(|| Error::invalid(field, expected, values.len()))
+    };
+    for (place, step) in slot.iter_mut().zip(episode.steps()) {
+        *place = position(&step.state, format!("steps[{}].state", step.step), "at least 3 values")?;
+    }
+    let goal = position(&episode.info().goal_position, "goal_position".into(), "3 values")?;
+    slot[slot.len() - 1] = goal;
+    Ok(())
+}
+
+fn check_count(expected: usize, episode: &Recording) -> anyhow::Result<()> {
+    let got = episode.steps().len();
+    ensure!(expected == got, "steps: expected {expected} as the header says, got {got}");
+    Ok(())
 }

@@ -5,7 +5,7 @@
 //! by committing, and a stream can be sent again without harm. What is lost on the way, or dropped because too many
 //! episodes are under way, is missing at the next commit, and so is never lost for good.
 
-use crate::episode::check_frame;
+use crate::frame;
 use crate::recordings::Recordings;
 use recording::Episode;
 use std::collections::{BTreeMap, HashMap};
@@ -72,7 +72,7 @@ impl Ingest {
         }
         let mut open = self.open();
         let Some(episode) = self.place(&mut open, &step.episode_id) else { return };
-        match check_frame(&step) {
+        match frame::check(&step) {
             Ok(()) => drop(episode.steps.insert(step.step, step)),
             Err(fault) => episode.fault = Some(fault),
         }
@@ -110,6 +110,8 @@ impl Ingest {
             return Err(Error::invalid("steps", format!("all steps below {count}"), extra));
         }
         self.recordings.keep(&Episode::new(request.episode.clone(), steps.into_values().collect())?)?;
+        metrics::counter!("cpn_recorder_episodes_total").increment(1);
+        metrics::counter!("cpn_recorder_steps_total").increment((*count).into());
         info!(episode = episode_id, steps = count, "kept");
         Ok(Commit::Kept)
     }

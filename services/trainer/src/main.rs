@@ -1,18 +1,29 @@
-//! `cpn-trainer`: the service that takes in demonstrations and publishes checkpoints, the training run, and what else is
-//! done with recordings.
+//! `cpn-trainer`: the service that takes in demonstrations, publishes checkpoints and starts training runs; the training
+//! run; and what is asked of the service or done with recordings.
 
 mod cli;
 
-use anyhow::{anyhow, ensure};
+use anyhow::{anyhow, bail, ensure};
 use clap::Parser;
-use cli::{Cli, Command, MirrorArgs, ReplayArgs, VerifyArgs};
+use cli::{
+    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, StartArgs, StopArgs,
+    TrainerArgs, VerifyArgs, VersionsArgs, WatchArgs,
+};
+use comfy_table::{LineStyle, Table, presets};
+use cpn::Preset;
+use serde::Deserialize;
+use serde::de::{IntoDeserializer, value};
 use service_kit::{config, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use trainer::progress::{Bar, Observer, StopIf};
+use trainer::config::Config;
+use trainer::journal::Journal;
+use trainer::progress::{Bar, JsonLines, Observer, StopIf, print_line};
 use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
-use trainer::{mirror, replay, service, verify};
+use trainer::{client, mirror, publish, replay, service, verify};
+use wire::training::{Run, RunState, StartRunRequest};
+use zenoh::Session;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
@@ -22,10 +33,20 @@ async fn main() -> anyhow::Result<()> {
         Command::Serve(arguments) => {
             serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await
         }
-        Command::Train(arguments) => train(config::load("CPN_TRAIN_", arguments.config.as_deref(), &arguments)?).await,
+        Command::Train(arguments) => {
+            train(Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?, arguments.json).await
+        }
+        Command::Preset(arguments) => print_preset(&arguments),
+        Command::Start(arguments) => start(arguments).await,
+        Command::Stop(arguments) => stop(arguments).await,
+        Command::Runs(arguments) => runs(arguments).await,
+        Command::Watch(arguments) => watch(arguments).await,
         Command::Replay(arguments) => replay(arguments).await,
         Command::Mirror(arguments) => mirror(arguments).await,
         Command::Verify(arguments) => verify(&arguments),
+        Command::Versions(arguments) => versions(arguments).await,
+        Command::Promote(arguments) => promote(arguments).await,
+        Command::Rollback(arguments) => rollback(arguments).await,
     }
 }
 
@@ -38,12 +59,15 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
     service.shutdown().await
 }
 
-async fn train(config: train::Config) -> anyhow::Result<()> {
+async fn train(config: Config, json: bool) -> anyhow::Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&stop);
     let mut run = tokio::task::spawn_blocking(move || {
         let stopped = StopIf(move |_| seen.load(Ordering::Relaxed));
-        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), Box::new(Bar::new(config.method.name()))];
+        let shown: Box<dyn Observer> =
+            if json { Box::new(JsonLines::default()) } else { Box::new(Bar::new(&config.name())) };
+        let journal = Journal::open(config.run_dir(), config.name())?;
+        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), shown, Box::new(journal)];
         train::run(&config, &mut observers)
     });
     let outcome = tokio::select! {
@@ -54,10 +78,70 @@ async fn train(config: train::Config) -> anyhow::Result<()> {
             run.await??
         }
     };
+    if json {
+        // Nobody may be left to read it.
+        let _ = print_line(&outcome);
+    }
     match outcome {
         Outcome::Finished { digest } => tracing::info!(digest, "checkpoint written"),
         Outcome::Interrupted { step } => tracing::info!(step, "interrupted; the same command goes on from here"),
     }
+    Ok(())
+}
+
+fn print_preset(PresetArgs { name }: &PresetArgs) -> anyhow::Result<()> {
+    let preset = Preset::deserialize(name.as_str().into_deserializer()).map_err(|e: value::Error| anyhow!(e))?;
+    print!("{}", toml::to_string(&Config::from(preset))?);
+    Ok(())
+}
+
+async fn start(arguments: StartArgs) -> anyhow::Result<()> {
+    let StartArgs { name, preset, hold_out, seed, settings, trainer } = arguments;
+    let request = StartRunRequest { name, preset, hold_out, seed, settings: settings.join("\n") };
+    let session = session::open(&trainer.session).await?;
+    let run = client::start(&session, &trainer.trainer, request).await?;
+    tell(session, &run).await
+}
+
+async fn stop(StopArgs { name, trainer }: StopArgs) -> anyhow::Result<()> {
+    let session = session::open(&trainer.session).await?;
+    let run = client::stop(&session, &trainer.trainer, name).await?;
+    tell(session, &run).await
+}
+
+async fn watch(WatchArgs { name, trainer }: WatchArgs) -> anyhow::Result<()> {
+    let session = session::open(&trainer.session).await?;
+    let run = client::watch(&session, &trainer.trainer, &name).await?;
+    tell(session, &run).await
+}
+
+async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: RunsArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let runs = client::list(&session, &trainer).await?;
+    if json {
+        println!("{}", serde_json::to_string_pretty(&runs)?);
+    } else {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
+        table.set_header(["run", "state", "step", "of", "loss"]);
+        for Run { name, state, progress } in &runs {
+            let of =
+                |value: fn(&trainer::progress::Progress) -> String| progress.as_ref().map(value).unwrap_or_default();
+            let (step, steps) = (of(|p| p.step.to_string()), of(|p| p.steps.to_string()));
+            table.add_row([name, state.name(), &step, &steps, &of(|p| format!("{:.4}", p.loss))]);
+        }
+        println!("{table}");
+    }
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+/// Says how a run is; that it failed is an error.
+async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
+    session.close().await.map_err(|e| anyhow!(e))?;
+    if let RunState::Failed { reason } = &run.state {
+        bail!("{} failed: {reason}", run.name);
+    }
+    println!("{} is {}", run.name, run.state.name());
     Ok(())
 }
 
@@ -89,4 +173,29 @@ fn verify(VerifyArgs { dataset, tasks, episodes, json }: &VerifyArgs) -> anyhow:
     }
     ensure!(report.faults.is_empty(), "{}: {} faults", dataset.display(), report.faults.len());
     Ok(())
+}
+
+async fn versions(VersionsArgs { model, json, session }: VersionsArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let versions = publish::list(&session, model).await?;
+    if json {
+        println!("{}", serde_json::to_string_pretty(&versions)?);
+    } else {
+        println!("{}", publish::table(&versions));
+    }
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+async fn promote(PromoteArgs { model, version, session }: PromoteArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let promoted = publish::promote(&session, model, version).await?;
+    println!("{} {} is promoted", promoted.model, promoted.version);
+    session.close().await.map_err(|e| anyhow!(e))
+}
+
+async fn rollback(RollbackArgs { model, session }: RollbackArgs) -> anyhow::Result<()> {
+    let session = session::open(&session).await?;
+    let promoted = publish::roll_back(&session, model).await?;
+    println!("{} {} is promoted", promoted.model, promoted.version);
+    session.close().await.map_err(|e| anyhow!(e))
 }

@@ -1,36 +1,16 @@
 //! How far a training run is, and who is told.
 
 use indicatif::{ProgressBar, ProgressStyle};
-use serde::{Deserialize, Serialize};
-use std::time::Instant;
+use serde::Serialize;
+use std::io::Write;
+use std::time::{Duration, Instant};
 use tracing::info;
+pub use wire::training::Progress;
 
 /// How much of the running mean of the loss a step takes over.
 const LOSS_WEIGHT: f64 = 0.02;
-
-/// How far a run is after a step.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Progress {
-    /// Steps done.
-    pub step: u64,
-    /// Steps of the whole run.
-    pub steps: u64,
-    /// Passes over every sample that are complete.
-    pub epoch: u64,
-    /// Passes of the whole run.
-    pub epochs: u64,
-    /// Samples that were trained on, counted once for each pass.
-    pub samples: u64,
-    /// Running mean of the outer loss.
-    pub loss: f64,
-    /// Learning rate of the step.
-    pub learning_rate: f64,
-    /// Norm of the gradient over all weights, before it was clipped.
-    pub gradient_norm: f64,
-    /// Samples that this process trained on in a second, since it began.
-    pub samples_per_second: f64,
-}
+/// Least time between two lines of JSON.
+const LINE_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Watches a run, and may end it.
 pub trait Observer {
@@ -106,7 +86,7 @@ impl Observer for Bar {
         self.0.set_length(steps);
         self.0.set_position(step);
         self.0.set_message(format!("loss {loss:.4}, {samples_per_second:.0} samples/s"));
-        if progress.ends_epoch() {
+        if ends_epoch(progress) {
             let (loss, rate) = (format!("{loss:.4}"), format!("{samples_per_second:.0}"));
             self.0.suspend(|| info!(epoch, loss, samples_per_second = rate, "epoch done"));
         }
@@ -114,11 +94,43 @@ impl Observer for Bar {
     }
 }
 
-impl Progress {
-    /// Whether the step was the last of its epoch.
-    pub fn ends_epoch(&self) -> bool {
-        (self.step * self.epochs).is_multiple_of(self.steps)
+/// Progress as lines of JSON on standard output, a few each second. When nobody reads them any more, the run ends.
+#[derive(Debug, Default)]
+pub struct JsonLines {
+    printed: Option<Instant>,
+    unread: bool,
+}
+
+impl Observer for JsonLines {
+    fn should_stop(&self, _step: u64) -> bool {
+        self.unread
     }
+
+    fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
+        let due = self.printed.is_none_or(|printed| printed.elapsed() > LINE_INTERVAL);
+        if due || progress.step == progress.steps {
+            self.unread = print_line(progress).is_err();
+            self.printed = Some(Instant::now());
+        }
+        Ok(())
+    }
+}
+
+/// Prints a value as one line of JSON.
+///
+/// # Errors
+/// If nobody reads it.
+pub fn print_line(value: &impl Serialize) -> std::io::Result<()> {
+    let mut line = serde_json::to_vec(value)?;
+    line.push(b'\n');
+    let mut out = std::io::stdout().lock();
+    out.write_all(&line)?;
+    out.flush()
+}
+
+/// Whether the step was the last of an epoch.
+pub(crate) fn ends_epoch(progress: &Progress) -> bool {
+    (progress.step * progress.epochs).is_multiple_of(progress.steps)
 }
 
 /// Turns what is known of single steps into the progress of a run.

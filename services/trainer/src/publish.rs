@@ -1,127 +1,181 @@
-//! Offers finished checkpoints to planners: an announcement names a digest, the bytes are fetched piece by piece.
+//! Publishing over zenoh: planners are told which version of each model to serve and fetch it piece by piece; people list,
+//! promote and roll back.
 
-use anyhow::{Context, anyhow};
-use std::collections::HashMap;
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
-use tracing::{info, warn};
-use wire::checkpoint::{CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse};
-use wire::{Code, Error, encode, key, query};
+use crate::versions::Versions;
+use anyhow::anyhow;
+use backon::{ConstantBuilder, Retryable};
+use comfy_table::{CellAlignment, LineStyle, Table, presets};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tracing::{debug, warn};
+use wire::checkpoint::{
+    CheckpointManifest, CheckpointVersion, ListVersionsRequest, ListVersionsResponse, PromoteVersionRequest,
+    PromoteVersionResponse, RollBackRequest, RollBackResponse,
+};
+use wire::{Code, Error, Message, encode, key, query};
 use zenoh::Session;
-use zenoh::sample::SampleKind;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::{Sample, SampleKind};
 
-/// How often the folder is looked at.
+/// How often the folder of checkpoints is looked at.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
+/// How long an answer may take.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A checkpoint on offer.
-#[derive(Debug)]
-struct Offer {
-    announcement: CheckpointAnnouncement,
-    modified: SystemTime,
-    bytes: Arc<Vec<u8>>,
-}
-
-/// The checkpoints of a folder, by model name, which is the stem of the file's name.
-#[derive(Debug)]
-struct Offers {
-    folder: PathBuf,
-    by_model: Mutex<HashMap<String, Offer>>,
-}
-
-impl Offers {
-    /// Reads new and changed files; answers what to announce.
-    fn refresh(&self) -> anyhow::Result<Vec<CheckpointAnnouncement>> {
-        let mut news = Vec::new();
-        for entry in std::fs::read_dir(&self.folder).with_context(|| self.folder.display().to_string())? {
-            let path = entry?.path();
-            let Some(model) = model_name(&path) else { continue };
-            let modified = std::fs::metadata(&path)?.modified()?;
-            let mut by_model = self.by_model.lock().unwrap_or_else(PoisonError::into_inner);
-            if by_model.get(&model).is_some_and(|offer| offer.modified == modified) {
-                continue;
-            }
-            let bytes = std::fs::read(&path)?;
-            let announcement = CheckpointAnnouncement {
-                model: model.clone(),
-                digest: cpn::checkpoint::digest(&bytes),
-                size_bytes: bytes.len() as u64,
-            };
-            news.push(announcement.clone());
-            by_model.insert(model, Offer { announcement, modified, bytes: Arc::new(bytes) });
-        }
-        Ok(news)
-    }
-
-    fn announcements(&self) -> Vec<CheckpointAnnouncement> {
-        let by_model = self.by_model.lock().unwrap_or_else(PoisonError::into_inner);
-        by_model.values().map(|offer| offer.announcement.clone()).collect()
-    }
-
-    /// The piece of the checkpoint whose digest stands in the query's key.
-    fn chunk(
-        &self,
-        digest: Option<String>,
-        request: &CheckpointChunkRequest,
-    ) -> Result<CheckpointChunkResponse, Error> {
-        let by_model = self.by_model.lock().unwrap_or_else(PoisonError::into_inner);
-        let digest = digest.unwrap_or_default();
-        let offer = by_model.values().find(|offer| offer.announcement.digest == digest).ok_or_else(|| {
-            let on_offer: Vec<_> = by_model.values().map(|offer| offer.announcement.digest.as_str()).collect();
-            Error::new(Code::NotFound, "digest", format!("one of {on_offer:?}"), &digest)
-        })?;
-        let size = offer.bytes.len();
-        let start = usize::try_from(request.offset_bytes)
-            .ok()
-            .filter(|start| *start < size)
-            .ok_or_else(|| Error::invalid("offset_bytes", format!("less than {size}"), request.offset_bytes))?;
-        let end = size.min(start + request.length_bytes as usize);
-        Ok(CheckpointChunkResponse { data: offer.bytes[start..end].to_vec() })
-    }
-}
-
-/// `cpn` for `cpn.safetensors`; none for any other file.
-fn model_name(path: &Path) -> Option<String> {
-    (path.extension()? == "safetensors").then(|| path.file_stem()?.to_str().map(str::to_owned))?
-}
-
-/// Announces every checkpoint of `folder` to every planner, those to come included, and serves their bytes, until the
-/// session closes.
+/// Announces the promoted version of every model to every planner, those to come included, and answers what is asked of
+/// the versions; when this returns, it does. The tasks end with the session, or with the reason why they cannot go on.
 ///
 /// # Errors
-/// If the folder cannot be read or zenoh refuses a declaration.
-pub async fn serve(session: &Session, folder: PathBuf) -> anyhow::Result<()> {
-    std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-    let offers = Offers { folder, by_model: Mutex::default() };
-    let zenoh = |e: zenoh::Error| anyhow!(e);
-    let chunks = session.declare_queryable(key::checkpoint_chunk("*")?).complete(true).await.map_err(zenoh)?;
-    let planners =
-        session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true).await.map_err(zenoh)?;
-    let mut poll = tokio::time::interval(POLL_INTERVAL);
-    loop {
-        let news = tokio::select! {
-            Ok(query) = chunks.recv_async() => {
-                let digest = key::digest_of_checkpoint_chunk(query.key_expr());
-                let answer = query::request(&query).and_then(|request| offers.chunk(digest, &request));
-                if let Err(error) = query::reply(&query, answer) {
-                    warn!(%error, "chunk not sent");
+/// If zenoh refuses a declaration.
+pub async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Result<JoinSet<anyhow::Result<()>>> {
+    let mut tasks = JoinSet::new();
+    serve(&mut tasks, session, key::checkpoint_chunk("*")?, versions, Versions::chunk).await?;
+    serve(&mut tasks, session, key::checkpoint_list_versions("*")?, versions, Versions::list).await?;
+    serve(&mut tasks, session, key::checkpoint_promote("*")?, versions, Versions::promote).await?;
+    serve(&mut tasks, session, key::checkpoint_roll_back("*")?, versions, Versions::roll_back).await?;
+    let planners = session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true);
+    let planners = planners.await.map_err(|e| anyhow!(e))?;
+    tasks.spawn(announce(session.clone(), planners, Arc::clone(versions)));
+    tasks.spawn(take_in(Arc::clone(versions)));
+    Ok(tasks)
+}
+
+/// Answers a queryable's requests, one after the other, where they may block.
+async fn serve<Q, R>(
+    tasks: &mut JoinSet<anyhow::Result<()>>,
+    session: &Session,
+    key: OwnedKeyExpr,
+    versions: &Arc<Versions>,
+    answer: fn(&Versions, Q) -> Result<R, Error>,
+) -> anyhow::Result<()>
+where
+    Q: Message + 'static,
+    R: Message + 'static,
+{
+    let queries = session.declare_queryable(key).complete(true).await.map_err(|e| anyhow!(e))?;
+    let versions = Arc::clone(versions);
+    tasks.spawn(async move {
+        while let Ok(query) = queries.recv_async().await {
+            let versions = Arc::clone(&versions);
+            let answering = tokio::task::spawn_blocking(move || {
+                let result = query::request(&query).and_then(|request| answer(&versions, request));
+                if let Err(error) = query::reply(&query, result) {
+                    warn!(%error, key = %query.key_expr(), "answer not sent");
                 }
-                continue;
-            }
-            Ok(token) = planners.recv_async() => match token.kind() {
-                SampleKind::Put => offers.announcements(),
-                SampleKind::Delete => continue,
-            },
-            _ = poll.tick() => offers.refresh().unwrap_or_else(|error| {
-                warn!(error = format!("{error:#}"), "checkpoint folder not read");
-                Vec::new()
-            }),
-            else => return Ok(()),
-        };
-        for announcement in news {
-            info!(model = announcement.model, digest = announcement.digest, "announced");
-            let key = key::checkpoint_announcement(&announcement.model)?;
-            session.put(key, encode(announcement)).await.map_err(zenoh)?;
+            });
+            answering.await?;
+        }
+        Ok(())
+    });
+    Ok(())
+}
+
+/// Tells planners what is promoted, whenever that changes or one of them appears. They pass over what they know.
+async fn announce(
+    session: Session,
+    planners: Subscriber<FifoChannelHandler<Sample>>,
+    versions: Arc<Versions>,
+) -> anyhow::Result<()> {
+    let mut promoted = versions.promoted();
+    loop {
+        let announcements: Vec<_> = promoted.borrow_and_update().values().cloned().collect();
+        for announcement in announcements {
+            let CheckpointManifest { model, version, digest, .. } = &announcement.manifest;
+            debug!(model, version, digest, "announced");
+            let key = key::checkpoint_announcement(model)?;
+            session.put(key, encode(announcement)).await.map_err(|e| anyhow!(e))?;
+        }
+        if !news(&mut promoted, &planners).await {
+            return Ok(());
         }
     }
+}
+
+/// Waits for another promotion or another planner; false once the session is closed.
+async fn news<T>(promoted: &mut watch::Receiver<T>, planners: &Subscriber<FifoChannelHandler<Sample>>) -> bool {
+    loop {
+        tokio::select! {
+            changed = promoted.changed() => return changed.is_ok(),
+            token = planners.recv_async() => match token.map(|token| token.kind()) {
+                Ok(SampleKind::Put) => return true,
+                Ok(SampleKind::Delete) => {}
+                Err(_) => return false,
+            },
+        }
+    }
+}
+
+/// Looks again and again for checkpoints that training runs have written.
+async fn take_in(versions: Arc<Versions>) -> anyhow::Result<()> {
+    let mut poll = tokio::time::interval(POLL_INTERVAL);
+    loop {
+        poll.tick().await;
+        let versions = Arc::clone(&versions);
+        if let Err(error) = tokio::task::spawn_blocking(move || versions.take_in()).await? {
+            warn!(error = format!("{error:#}"), "checkpoint folder not read");
+        }
+    }
+}
+
+/// The versions of a model, or of all, that a trainer keeps.
+///
+/// # Errors
+/// `NOT_FOUND` for an unknown model; `UNAVAILABLE` if there is no trainer.
+pub async fn list(session: &Session, model: Option<String>) -> Result<Vec<CheckpointVersion>, Error> {
+    let key = key::checkpoint_list_versions(model.as_deref().unwrap_or("*"))?;
+    let response: ListVersionsResponse = call(session, &key, ListVersionsRequest { model }).await?;
+    Ok(response.versions)
+}
+
+/// Lets planners serve a version; answers what is promoted now.
+///
+/// # Errors
+/// `NOT_FOUND` for an unknown model or version; `UNAVAILABLE` if there is no trainer.
+pub async fn promote(session: &Session, model: String, version: u32) -> Result<CheckpointManifest, Error> {
+    let key = key::checkpoint_promote(&model)?;
+    let response: PromoteVersionResponse = call(session, &key, PromoteVersionRequest { model, version }).await?;
+    Ok(response.manifest)
+}
+
+/// Lets planners serve the version that was promoted before; answers what is promoted now.
+///
+/// # Errors
+/// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if none was; `UNAVAILABLE` if there is no trainer.
+pub async fn roll_back(session: &Session, model: String) -> Result<CheckpointManifest, Error> {
+    let key = key::checkpoint_roll_back(&model)?;
+    let response: RollBackResponse = call(session, &key, RollBackRequest { model }).await?;
+    Ok(response.manifest)
+}
+
+/// Asks a trainer, and for five seconds again if there is none: the session may have been opened just now. What may have
+/// reached one is not asked again, as rolling back twice is not rolling back once.
+async fn call<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyExpr, request: Q) -> Result<R, Error> {
+    let patience = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(25);
+    let ask = || query::call(session, key, request.clone(), TIMEOUT);
+    ask.retry(patience).when(|error: &Error| error.code == Code::Unavailable).await
+}
+
+/// Versions for a terminal, the promoted one marked, with the first digits of their digests.
+pub fn table(versions: &[CheckpointVersion]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
+    table.set_header(["model", "version", "promoted", "bytes", "digest", "configuration", "parents"]);
+    let short = |digest: &String| digest[..digest.floor_char_boundary(12)].to_owned();
+    for CheckpointVersion { manifest, promoted } in versions {
+        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents } = manifest;
+        let parents = parents.iter().map(short).collect::<Vec<_>>().join(" ");
+        let promoted = if *promoted { "yes" } else { "" };
+        let (version, bytes) = (version.to_string(), size_bytes.to_string());
+        table.add_row([model.clone(), version, promoted.into(), bytes, short(digest), short(config_digest), parents]);
+    }
+    for column in [1, 3] {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table
 }

@@ -1,20 +1,15 @@
 //! The recorder over zenoh: takes in streams, tells what it keeps, and sends it again to whoever asks.
 
 use crate::ingest::{Commit, Ingest};
+use crate::queries::serve;
 use crate::recordings::Recordings;
 use std::sync::Arc;
-use tokio::runtime::Handle;
-use tokio::sync::Semaphore;
 use tracing::warn;
 use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse};
-use wire::{Code, Error, encode, key, query};
-use zenoh::key_expr::OwnedKeyExpr;
+use wire::{Error, encode, key, query};
 use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait};
-
-/// Queries of one kind that are answered or wait for it at the same time; each holds an episode at most.
-const PLACES: usize = 16;
 
 /// What makes a recorder; it stops when this is dropped.
 #[derive(Debug)]
@@ -44,32 +39,6 @@ pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<I
     let commit =
         serve(session, key::demonstration_commit("*")?, move |query| commit(&announcer, &ingest, query)).await?;
     Ok(Recorder { _steps: steps, _queryables: [list, send, commit] })
-}
-
-/// Answers queries on threads that may read and write files; zenoh's callback only starts them. Recorders hold
-/// different episodes, so none is complete.
-async fn serve(
-    session: &Session,
-    key: OwnedKeyExpr,
-    answer: impl Fn(&Query) -> zenoh::Result<()> + Send + Sync + 'static,
-) -> zenoh::Result<Queryable<()>> {
-    let (places, runtime, answer) = (Arc::new(Semaphore::new(PLACES)), Handle::current(), Arc::new(answer));
-    let callback = move |query: Query| {
-        let (place, answer) = (Arc::clone(&places).try_acquire_owned(), Arc::clone(&answer));
-        runtime.spawn_blocking(move || {
-            let answered = match place {
-                Ok(_place) => answer(&query),
-                Err(_) => {
-                    let got = format!("{PLACES} waiting");
-                    query::refuse(&query, Error::new(Code::ResourceExhausted, "queue", "a free place", got))
-                }
-            };
-            if let Err(error) = answered {
-                warn!(key = %query.key_expr(), %error, "answer not sent");
-            }
-        });
-    };
-    session.declare_queryable(key).callback(callback).await
 }
 
 fn commit(session: &Session, ingest: &Ingest, query: &Query) -> zenoh::Result<()> {

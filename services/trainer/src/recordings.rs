@@ -4,7 +4,7 @@ use anyhow::{Context, ensure};
 use recording::Episode;
 use service_kit::files;
 use sha2::{Digest, Sha256};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -12,14 +12,11 @@ use tracing::warn;
 use wire::demonstration::RecordedEpisode;
 use wire::{Code, Error};
 
-/// Name of the file in a folder that the process that keeps it has locked.
-const LOCK: &str = ".lock";
-
 /// The recordings that one process keeps, known by their headers.
 #[derive(Debug)]
 pub struct Recordings {
     folder: PathBuf,
-    /// Held as long as this lives: two processes would each know a part.
+    /// Held as long as this lives.
     _lock: File,
     index: Mutex<Index>,
     /// Held from the check to the entry: two episodes of one id are never written both.
@@ -40,9 +37,7 @@ impl Recordings {
     /// # Errors
     /// If the folder cannot be made or read, another process has it, or its recordings differ in their render spec.
     pub fn open(folder: PathBuf) -> anyhow::Result<Self> {
-        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-        let lock = File::create(folder.join(LOCK)).with_context(|| folder.display().to_string())?;
-        lock.try_lock().with_context(|| format!("{}: expected a folder that no process keeps", folder.display()))?;
+        let lock = files::take_over(&folder)?;
         for task in tasks(&folder)? {
             files::remove_unfinished(&folder.join(task))?;
         }
@@ -180,12 +175,6 @@ pub fn read(folder: &Path, path: &Path) -> anyhow::Result<Episode> {
 /// If the folder cannot be read.
 pub fn tasks(folder: &Path) -> anyhow::Result<Vec<String>> {
     names(folder, |path| path.is_dir())
-}
-
-/// The names of the tasks of some episodes, in order.
-pub fn tasks_of(episodes: &[RecordedEpisode]) -> Vec<String> {
-    let names: BTreeSet<_> = episodes.iter().map(|episode| &episode.variation.task).collect();
-    names.into_iter().cloned().collect()
 }
 
 /// The recordings of a folder, in order of task and name.

@@ -1,24 +1,50 @@
-//! The trainer's network face: demonstrations in, checkpoints out.
+//! The trainer's network face: demonstrations in, checkpoints out, training runs started, watched and stopped.
 
 use crate::ingest::{Ingest, Limits};
 use crate::publish;
 use crate::recorder::{self, Recorder};
 use crate::recordings::Recordings;
+use crate::runs::{self, Runs};
+use crate::runs_zenoh::{self, RunsZenoh};
+use crate::versions::Versions;
+use crate::{grpc, runs_metrics};
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
-use service_kit::SessionConfig;
+use service_kit::{GrpcServer, SessionConfig, metrics};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::task::JoinSet;
+use tracing::info;
+
+/// How long requests in flight may take to finish at shutdown.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Settings of the service.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
+    /// Names the trainer in its zenoh keys.
+    pub name: String,
     /// Where episodes are kept.
     pub dataset: PathBuf,
     /// Whose checkpoints are published.
     pub checkpoints: PathBuf,
+    /// Versions of a model that are kept.
+    pub keep_versions: NonZeroU16,
+    /// Folder of the training runs' folders.
+    pub runs: PathBuf,
+    /// Most training runs at the same time.
+    pub max_runs: NonZeroU16,
+    /// Where gRPC listens; port 0 takes a free one.
+    pub grpc_listen: SocketAddr,
+    /// Where Prometheus finds metrics; none are served if it is not given.
+    pub metrics_listen: Option<SocketAddr>,
+    /// What is started for a training run: this program, unless another embeds the service.
+    #[serde(skip)]
+    pub program: PathBuf,
     /// How to join the others.
     pub session: SessionConfig,
 }
@@ -26,8 +52,15 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
+            name: "trainer".into(),
             dataset: "data/demonstrations".into(),
             checkpoints: "runs/checkpoints".into(),
+            keep_versions: const { NonZeroU16::new(5).expect("not zero") },
+            runs: "runs/training".into(),
+            max_runs: NonZeroU16::MIN,
+            grpc_listen: (Ipv4Addr::LOCALHOST, 50052).into(),
+            metrics_listen: None,
+            program: std::env::current_exe().unwrap_or_else(|_| "cpn-trainer".into()),
             session: SessionConfig::default(),
         }
     }
@@ -38,26 +71,61 @@ impl Default for Config {
 pub struct Service {
     session: zenoh::Session,
     recorder: Recorder,
+    runs: Runs,
+    runs_zenoh: RunsZenoh,
+    grpc: GrpcServer,
     tasks: JoinSet<anyhow::Result<()>>,
 }
 
 /// Starts the service; when this returns, it answers.
 ///
 /// # Errors
-/// If the dataset is mixed or cannot be read, or the session cannot be opened.
+/// If the dataset is mixed or cannot be read, the published versions cannot be read, an address cannot be listened on, the
+/// session cannot be opened, or the name cannot stand in a key.
 pub async fn start(config: Config) -> anyhow::Result<Service> {
-    let folder = config.dataset.clone();
-    let recordings = Arc::new(tokio::task::spawn_blocking(move || Recordings::open(folder)).await??);
+    let Config { name, dataset, checkpoints, keep_versions, runs, max_runs, program, .. } = config;
+    if let Some(listen) = config.metrics_listen {
+        metrics::serve(listen)?;
+    }
+    let of_runs = runs::Config {
+        folder: runs,
+        dataset: dataset.clone(),
+        checkpoints: checkpoints.clone(),
+        max_runs: max_runs.get().into(),
+        program,
+    };
+    let open = move || {
+        let versions = Versions::open(checkpoints, keep_versions)?;
+        anyhow::Ok((Arc::new(Recordings::open(dataset)?), Arc::new(versions), Runs::open(of_runs)?))
+    };
+    let (recordings, versions, runs) = tokio::task::spawn_blocking(open).await??;
     let session = service_kit::session::open(&config.session).await?;
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
     let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
-    let mut tasks = JoinSet::new();
-    let publisher = session.clone();
-    tasks.spawn(async move { publish::serve(&publisher, config.checkpoints).await });
-    Ok(Service { session, recorder, tasks })
+    let runs_zenoh = runs_zenoh::start(&session, &name, &runs).await?;
+    let grpc = grpc::start(runs.clone(), config.grpc_listen).await?;
+    let mut tasks = publish::start(&session, &versions).await?;
+    let measured = runs.clone();
+    tasks.spawn(async move {
+        runs_metrics::follow(measured).await;
+        Ok(())
+    });
+    grpc.ready().await;
+    info!(name, grpc = %grpc.address, "trainer is ready");
+    Ok(Service { session, recorder, runs, runs_zenoh, grpc, tasks })
 }
 
 impl Service {
+    /// The training runs, without a transport.
+    pub fn runs(&self) -> Runs {
+        self.runs.clone()
+    }
+
+    /// Where gRPC listens.
+    pub fn grpc_address(&self) -> SocketAddr {
+        self.grpc.address
+    }
+
     /// Runs until a part of the service fails.
     ///
     /// # Errors
@@ -69,13 +137,19 @@ impl Service {
         }
     }
 
-    /// Leaves the network. Every episode that was acknowledged is on disk already.
+    /// Interrupts the training runs, which save their states, and leaves the network. Every episode that was acknowledged
+    /// is on disk already.
     ///
     /// # Errors
-    /// If the session does not close.
+    /// If gRPC had failed before, or the session does not close.
     pub async fn shutdown(mut self) -> anyhow::Result<()> {
         drop(self.recorder);
+        self.runs.shutdown().await;
+        // Who watches a run has seen its end; a client that keeps asking does not keep the service.
+        let drained = tokio::time::timeout(DRAIN_TIMEOUT, self.grpc.drain()).await;
+        drop(self.runs_zenoh);
         self.tasks.shutdown().await;
-        self.session.close().await.map_err(|e| anyhow!(e))
+        self.session.close().await.map_err(|e| anyhow!(e))?;
+        drained.unwrap_or(Ok(()))
     }
 }

@@ -1,83 +1,27 @@
 //! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
 
 use crate::adam::Adam;
-use crate::dataset::{Batch, Dataset};
-use crate::positions::Trajectories;
+use crate::config::Config;
+use crate::dataset::Dataset;
+use crate::learner::Learner;
 use crate::progress::{Meter, Observer};
+use crate::sampler::Sampler;
 use anyhow::{Context, ensure};
+use cpn::Recipe;
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, EncoderConfig, EncoderPreset, Input, MethodKind, ModelConfig};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::f64::consts::PI;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::mpsc;
+use std::thread;
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// How often a run saves its state.
-const SAVE_INTERVAL: Duration = Duration::from_secs(60);
-
-/// Settings of a run; the defaults are those of the shipped checkpoints.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// Folder of the demonstrations.
-    pub dataset: PathBuf,
-    /// Where the checkpoint goes.
-    pub out: PathBuf,
-    /// Method to train.
-    pub method: MethodKind,
-    /// What observations and goals are; positions are for tasks whose goal is one.
-    pub input: Input,
-    /// Encoder of images to train it with.
-    pub encoder: EncoderPreset,
-    /// H; the paper's if none is given.
-    pub horizon: Option<i64>,
-    /// U; the paper's if none is given.
-    pub updates: Option<i64>,
-    /// Share of the samples whose goal is a position that the hand reached later, instead of the one it was given.
-    pub hindsight: f64,
-    /// Tasks that the model must not see.
-    pub hold_out: Vec<String>,
-    /// Passes over every frame.
-    pub epochs: u32,
-    /// Samples of a step.
-    pub batch_size: usize,
-    /// Highest learning rate of the one-cycle schedule.
-    pub peak_learning_rate: f64,
-    /// Longest gradient, as a norm over all weights.
-    pub max_gradient_norm: f64,
-    /// Seed of initialisation and sampling.
-    pub seed: u64,
-    /// Threads of libtorch; 0 leaves it to libtorch.
-    pub threads: i32,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self {
-            dataset: "data/demonstrations".into(),
-            out: "runs/checkpoints/cpn.safetensors".into(),
-            method: MethodKind::Cpn,
-            input: Input::Image,
-            encoder: EncoderPreset::Paper,
-            horizon: None,
-            updates: None,
-            hindsight: 0.0,
-            hold_out: Vec::new(),
-            epochs: 5,
-            batch_size: 128,
-            peak_learning_rate: 1.5e-3,
-            max_gradient_norm: 10.0,
-            seed: 0,
-            threads: 0,
-        }
-    }
-}
-
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The checkpoint of this digest is written.
     Finished {
@@ -95,112 +39,67 @@ pub enum Outcome {
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ResumePoint {
-    config: Config,
+    recipe: Recipe,
+    seed: u64,
     data_digest: String,
+    /// Steps done.
     step: u64,
     /// Running mean of the loss, for those who watch.
     loss: Option<f64>,
 }
 
-/// What a training run reads.
-pub trait Demonstrations {
-    /// A moment of an episode.
-    type Sample;
-    /// Names of the tasks, in order.
-    fn tasks(&self) -> Vec<String>;
-    /// Number of episodes.
-    fn episode_count(&self) -> usize;
-    /// Number of moments with an action.
-    fn sample_count(&self) -> usize;
-    /// A, the size of an action.
-    fn action_size(&self) -> i64;
-    /// What [`crate::recordings::dataset_digest`] gives for the episodes.
-    fn digest(&self) -> &str;
-    /// How every frame was rendered; empty for those of a real camera, and where none is looked at.
-    fn render_spec(&self) -> &str;
-    /// Every moment with an action once, in an order that the seed and the epoch decide.
-    fn shuffled(&self, seed: u64, epoch: u64) -> Vec<Self::Sample>;
-    /// The tensors of some moments, with the next H actions of each.
-    fn batch(&self, samples: &[Self::Sample], horizon: i64) -> Batch;
-}
-
 /// Trains until the checkpoint is written or `observer` stops it; from a saved state if there is one.
 ///
 /// # Errors
-/// If the demonstrations cannot be read, the saved state belongs to another run, the loss is no longer finite, a file
-/// cannot be written, or the observer fails.
+/// If the settings are out of range or do not fit the demonstrations, these cannot be read, the saved state belongs to
+/// another run, the loss is no longer finite, a file cannot be written, or the observer fails.
 pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outcome> {
-    ensure!(config.batch_size > 0 && config.epochs > 0, "batch_size and epochs: expected at least 1, got 0");
-    if config.threads > 0 {
-        tch::set_num_threads(config.threads);
-    }
-    match config.input {
-        Input::Image => {
-            ensure!(config.hindsight == 0.0, "hindsight: expected 0 for images, got {}", config.hindsight);
-            let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
-            run_on(config, &dataset, config.encoder.into(), observer)
-        }
-        Input::Position => {
-            ensure!(config.hold_out.is_empty(), "hold_out: expected none for positions, got {:?}", config.hold_out);
-            let trajectories = Trajectories::load(&config.dataset, config.hindsight)?;
-            let encoder = trajectories.encoder();
-            run_on(config, &trajectories, encoder, observer)
-        }
-    }
-}
+    let recipe = config.recipe();
+    recipe.validate()?;
+    let Recipe { model, training } = &recipe;
+    tch::set_num_threads(i32::try_from(config.threads).context("threads: expected a number of them")?);
+    let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
+    let dataset = Dataset::load(&config.dataset, &config.hold_out, model.encoder.input())?;
+    let (expected, got) = (model.actions, dataset.action_size());
+    ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
+    let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
+    info!(tasks = tasks.len(), episodes = dataset.episodes().len(), samples = dataset.sample_count(), "demonstrations");
 
-fn run_on(
-    config: &Config,
-    dataset: &impl Demonstrations,
-    encoder: EncoderConfig,
-    observer: &mut dyn Observer,
-) -> anyhow::Result<Outcome> {
-    let tasks = dataset.tasks();
-    info!(tasks = tasks.len(), episodes = dataset.episode_count(), samples = dataset.sample_count(), "demonstrations");
+    let mut learner = Learner::new(&recipe, config.seed, config.threads);
+    let state = Saved { path: config.out.with_extension("resume"), config, dataset: &dataset };
+    let (start, loss) = state.resume(&mut learner.optimiser)?;
+    observer.begin(start)?;
 
-    let paper = ModelConfig::paper(config.method);
-    let model = ModelConfig {
-        encoder,
-        actions: dataset.action_size(),
-        horizon: config.horizon.unwrap_or(paper.horizon),
-        updates: config.updates.unwrap_or(paper.updates),
-        ..paper
-    };
-    model.validate()?;
-    let agent = Agent::new(model, config.seed);
-    let mut adam = Adam::new(agent.variables());
-    let resume_path = config.out.with_extension("resume");
-    let (mut step, loss) = resume(&resume_path, config, dataset.digest(), &mut adam)?;
-
-    let sample_count = dataset.sample_count() as u64;
-    let per_epoch = sample_count.div_ceil(config.batch_size as u64);
-    let total = per_epoch * u64::from(config.epochs);
-    let samples_done = step / per_epoch * sample_count + step % per_epoch * config.batch_size as u64;
-    let mut meter = Meter::new(total, config.epochs.into(), samples_done, loss);
-    observer.begin(step)?;
+    let sampler = Sampler::new(&dataset, &recipe, config.seed);
+    let total = sampler.steps_per_epoch() * u64::from(training.epochs);
+    let mut meter = Meter::new(total, training.epochs.into(), sampler.samples_before(start), loss);
     let mut saved = Instant::now();
-    while step < total {
-        let epoch = step / per_epoch;
-        let samples = dataset.shuffled(config.seed, epoch);
-        for samples in samples.chunks(config.batch_size).skip((step % per_epoch) as usize) {
+    let interrupted = thread::scope(|scope| {
+        // Batches are made while the last one is computed with.
+        let (sender, batches) = mpsc::sync_channel(1);
+        scope.spawn(move || {
+            let mut batches = sampler.batches(start).take((total - start) as usize);
+            // The run may end before its batches do.
+            let _ = batches.try_for_each(|batch| sender.send(batch));
+        });
+        for (step, batch) in (start..total).zip(batches) {
             if observer.should_stop(step) {
-                save(&resume_path, config, dataset.digest(), &adam, step, &meter)?;
-                return Ok(Outcome::Interrupted { step });
+                state.save(step, &learner.optimiser, &meter)?;
+                return Ok(Some(step));
             }
-            let batch = dataset.batch(samples, agent.config().horizon);
-            let loss = agent.outer_loss(&batch.observations, &batch.goals, &batch.actions, &batch.mask);
-            let value = loss.double_value(&[]);
-            ensure!(value.is_finite(), "loss: expected a finite number, got {value} at step {step}");
-            loss.backward();
-            let learning_rate = one_cycle(step, total, config.peak_learning_rate);
-            let norm = adam.step(learning_rate, config.max_gradient_norm);
-            step += 1;
-            observer.observe(&meter.step(step, samples.len(), value, learning_rate, norm))?;
-            if saved.elapsed() > SAVE_INTERVAL {
-                save(&resume_path, config, dataset.digest(), &adam, step, &meter)?;
+            let learning_rate = one_cycle(step, total, training.peak_learning_rate);
+            let learnt = learner.step(&batch, learning_rate).with_context(|| format!("step {step}"))?;
+            let samples = batch.observations.size()[0] as usize;
+            observer.observe(&meter.step(step + 1, samples, learnt.loss, learning_rate, learnt.gradient_norm))?;
+            if saved.elapsed() >= save_interval {
+                state.save(step + 1, &learner.optimiser, &meter)?;
                 saved = Instant::now();
             }
         }
+        anyhow::Ok(None)
+    })?;
+    if let Some(step) = interrupted {
+        return Ok(Outcome::Interrupted { step });
     }
 
     let provenance = Provenance {
@@ -208,13 +107,11 @@ fn run_on(
         data_digest: dataset.digest().to_owned(),
         render_spec: dataset.render_spec().to_owned(),
         seed: config.seed,
-        epochs: config.epochs,
+        training: training.clone(),
     };
-    let bytes = checkpoint::to_bytes(&agent, &provenance)?;
+    let bytes = checkpoint::to_bytes(&learner.agent, &provenance)?;
     files::write_atomically(&config.out, &bytes)?;
-    if resume_path.exists() {
-        std::fs::remove_file(&resume_path)?;
-    }
+    state.remove()?;
     Ok(Outcome::Finished { digest: checkpoint::digest(&bytes) })
 }
 
@@ -227,24 +124,43 @@ fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
     low + (peak - low) * 0.5 * (1.0 + (PI * progress).cos())
 }
 
-fn save(path: &Path, config: &Config, digest: &str, adam: &Adam, step: u64, meter: &Meter) -> anyhow::Result<()> {
-    let point = ResumePoint { config: config.clone(), data_digest: digest.to_owned(), step, loss: meter.loss };
-    files::write_atomically(path, &archive::to_bytes(&adam.state(), &point)?)
+/// A run's state, on disk beside its checkpoint.
+struct Saved<'a> {
+    path: PathBuf,
+    config: &'a Config,
+    dataset: &'a Dataset,
 }
 
-/// Takes up a saved state; answers the number of steps done and the mean loss.
-fn resume(path: &Path, config: &Config, digest: &str, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
-    if !path.exists() {
-        return Ok((0, None));
+impl Saved<'_> {
+    fn point(&self, step: u64, loss: Option<f64>) -> ResumePoint {
+        let Config { seed, .. } = *self.config;
+        ResumePoint { recipe: self.config.recipe(), seed, data_digest: self.dataset.digest().to_owned(), step, loss }
     }
-    let mut take_up = || {
-        let (state, point): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(path)?)?;
-        let expected = ResumePoint { config: config.clone(), data_digest: digest.to_owned(), ..point };
-        let same_run = expected.config == point.config && expected.data_digest == point.data_digest;
-        ensure!(same_run, "expected the state of this run, {expected:?}, got that of another, {point:?}");
-        adam.restore(&state, i32::try_from(point.step)?)?;
-        info!(step = point.step, "resumed");
-        Ok((point.step, point.loss))
-    };
-    take_up().with_context(|| format!("resuming from {} (remove it to start anew)", path.display()))
+
+    fn save(&self, step: u64, adam: &Adam, meter: &Meter) -> anyhow::Result<()> {
+        files::write_atomically(&self.path, &archive::to_bytes(&adam.state(), &self.point(step, meter.loss))?)
+    }
+
+    /// Takes up the state, if there is one; answers the number of steps done and the mean loss.
+    fn resume(&self, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
+        if !self.path.exists() {
+            return Ok((0, None));
+        }
+        let mut take_up = || {
+            let (state, got): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(&self.path)?)?;
+            let expected = self.point(got.step, got.loss);
+            ensure!(expected == got, "expected the state of this run, {expected:?}, got that of another, {got:?}");
+            adam.restore(&state, i32::try_from(got.step)?)?;
+            info!(step = got.step, "resumed");
+            Ok((got.step, got.loss))
+        };
+        take_up().with_context(|| format!("resuming from {} (remove it to start anew)", self.path.display()))
+    }
+
+    fn remove(&self) -> anyhow::Result<()> {
+        if self.path.exists() {
+            std::fs::remove_file(&self.path).with_context(|| self.path.display().to_string())?;
+        }
+        Ok(())
+    }
 }

@@ -5,11 +5,15 @@
 mod common;
 
 use common::{SPEC, episode, info, keep, steps};
-use cpn::{EncoderConfig, EncoderPreset, MethodKind, checkpoint};
+use cpn::recipe::GoalSampling;
+use cpn::{Input, MethodKind, ModelConfig, Preset, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
+use trainer::config::Config;
+use trainer::dataset::Dataset;
 use trainer::progress::{Observer, Progress, StopIf};
-use trainer::train::{self, Config, Demonstrations, Outcome};
+use trainer::sampler::Sampler;
+use trainer::train::{self, Outcome};
 
 fn config(folder: &Path, name: &str) -> Config {
     let dataset = folder.join("data");
@@ -19,7 +23,13 @@ fn config(folder: &Path, name: &str) -> Config {
         }
     }
     let out = folder.join(format!("{name}.safetensors"));
-    Config { dataset, out, epochs: 2, batch_size: 6, seed: 4, threads: 1, ..Config::default() }
+    Config { dataset, out, seed: 4, ..quick(Preset::Cpn.into(), 2, 6) }
+}
+
+/// The same with other passes and samples of a step.
+fn quick(config: Config, epochs: u32, batch_size: usize) -> Config {
+    let training = Training { epochs, batch_size, samples_per_draw: 3, ..config.training.clone() };
+    Config { training, ..config }
 }
 
 fn finished(config: &Config) -> String {
@@ -89,8 +99,6 @@ fn progress_goes_on_after_an_interruption() {
     // 21 samples in batches of 6, twice.
     assert_eq!(whole.iter().map(|progress| progress.samples).collect::<Vec<_>>(), [6, 12, 18, 21, 27, 33, 39, 42]);
     assert_eq!(whole.iter().map(|progress| progress.epoch).collect::<Vec<_>>(), [0, 0, 0, 1, 1, 1, 1, 2]);
-    let ends: Vec<u64> = whole.iter().filter(|progress| progress.ends_epoch()).map(|progress| progress.step).collect();
-    assert_eq!(ends, [4, 8]);
     assert!(whole.iter().all(|progress| progress.gradient_norm > 0.0 && progress.learning_rate > 0.0));
     assert!(whole.windows(2).all(|pair| pair[0].loss != pair[1].loss));
 }
@@ -108,26 +116,43 @@ fn a_state_of_another_run_is_not_taken_up() {
 fn the_checkpoint_tells_where_it_comes_from() {
     let folder = tempfile::tempdir().unwrap();
     for method in MethodKind::ALL {
-        let config =
-            Config { method, epochs: 1, hold_out: vec!["door-lock".into()], ..config(folder.path(), method.name()) };
+        let config = config(folder.path(), method.name());
+        let config = Config { model: ModelConfig::paper(method), hold_out: vec!["door-lock".into()], ..config };
         let digest = finished(&config);
         let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
         assert_eq!(loaded.digest, digest);
         assert_eq!(loaded.agent.config().method, method);
         assert_eq!(loaded.provenance.training_tasks, ["reach"]);
-        assert_eq!((loaded.provenance.seed, loaded.provenance.epochs), (4, 1));
+        assert_eq!((loaded.provenance.seed, &loaded.provenance.training), (4, &config.training));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
         assert_eq!(loaded.provenance.render_spec, SPEC);
     }
 }
 
+/// What a preset prints is what it is, and can be changed from a file, by name.
 #[test]
-fn the_encoder_is_chosen_by_name() {
+fn settings_come_in_layers_over_a_preset() {
+    for preset in Preset::ALL {
+        let printed = toml::to_string(&Config::from(preset)).unwrap();
+        assert_eq!(Config::from_toml(&printed).unwrap(), Config::from(preset));
+    }
     let folder = tempfile::tempdir().unwrap();
-    let config = Config { encoder: EncoderPreset::Upn, method: MethodKind::Bc, ..config(folder.path(), "upn-encoder") };
-    finished(&config);
-    let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
-    assert_eq!(loaded.agent.config().encoder, EncoderConfig::upn());
+    let file = folder.path().join("settings.toml");
+    std::fs::write(&file, "preset = \"paper-upn\"\ntraining.epochs = 7\nmodel.updates = 3\n").unwrap();
+    let typed = serde_json::json!({"seed": 9});
+    let load = |changes: &[&str]| {
+        Config::load(Some(&file), &typed, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>())
+    };
+    let config = load(&["training.goals=hindsight", "model.encoder.latent=32"]).unwrap();
+    assert_eq!((config.preset, config.seed, config.training.epochs), (Preset::PaperUpn, 9, 7));
+    assert_eq!((config.model.updates, config.model.encoder.latent()), (3, 32));
+    assert_eq!(config.training.goals, GoalSampling::Hindsight);
+
+    let refused = |change: &str| format!("{:#}", load(&[change]).unwrap_err());
+    assert!(refused("training.epoch=7").contains("unknown field"), "{}", refused("training.epoch=7"));
+    assert_eq!(refused("training.batch_size=0"), "training.batch_size: expected 1 to 65536, got 0");
+    assert_eq!(refused("epochs"), "expected key=value, got \"epochs\"");
+    assert!(refused("preset=fast").contains("unknown variant"), "{}", refused("preset=fast"));
 }
 
 /// Noise can be learnt by heart: the loss must fall far below that of a policy that knows nothing.
@@ -136,15 +161,15 @@ fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
     let base = config(folder.path(), "short");
     let loss_of = |path: &Path| {
-        let mut agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
-        agent.variables_mut().unfreeze();
-        let dataset = trainer::dataset::Dataset::load(&base.dataset, &[]).unwrap();
-        let batch = dataset.batch(&dataset.shuffled(0, 0), agent.config().horizon);
-        agent.outer_loss(&batch.observations, &batch.goals, &batch.actions, &batch.mask).double_value(&[])
+        let agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        let dataset = Dataset::load(&base.dataset, &[], Input::Image).unwrap();
+        let recipe = base.recipe();
+        let sampler = Sampler::new(&dataset, &recipe, 0);
+        agent.outer_loss(&sampler.batch(0, &sampler.epoch(0))).double_value(&[])
     };
-    finished(&Config { epochs: 1, batch_size: 50, ..base.clone() });
+    finished(&quick(base.clone(), 1, 50));
     let before = loss_of(&base.out);
-    let long = Config { epochs: 40, out: folder.path().join("long.safetensors"), ..base.clone() };
+    let long = Config { out: folder.path().join("long.safetensors"), ..quick(base.clone(), 40, 6) };
     finished(&long);
     let after = loss_of(&long.out);
     assert!(after < 0.5 * before, "{before} before, {after} after");
@@ -160,8 +185,11 @@ fn bad_input_is_named() {
     assert!(message.contains("hold_out: expected some of [\"door-lock\", \"reach\"], got \"door-lokc\""), "{message}");
     let message = refused(&Config { dataset: folder.path().join("nowhere"), ..good.clone() });
     assert!(message.contains("nowhere"), "{message}");
-    let message = refused(&Config { batch_size: 0, ..good.clone() });
+    let message = refused(&quick(good.clone(), 1, 0));
     assert!(message.contains("batch_size"), "{message}");
+    let model = ModelConfig { actions: 3, ..good.model.clone() };
+    let message = refused(&Config { model, ..good.clone() });
+    assert_eq!(message, "model.actions: expected 4 as the demonstrations have, got 3");
 
     let mut others = steps("reach", 3, 4);
     for step in &mut others {

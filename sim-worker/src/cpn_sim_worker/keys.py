@@ -67,6 +67,26 @@ def planner_list_models(planner: str) -> str:
     return f"{ROOT}/planner/{planner}/list_models"
 
 
+def trainer_start_run(trainer: str) -> str:
+    """Queryable: `StartRunRequest` to `StartRunResponse`."""
+    return f"{ROOT}/trainer/{trainer}/start_run"
+
+
+def trainer_stop_run(trainer: str) -> str:
+    """Queryable: `StopRunRequest` to `StopRunResponse`."""
+    return f"{ROOT}/trainer/{trainer}/stop_run"
+
+
+def trainer_list_runs(trainer: str) -> str:
+    """Queryable: `ListRunsRequest` to `ListRunsResponse`."""
+    return f"{ROOT}/trainer/{trainer}/list_runs"
+
+
+def training_progress(run: str) -> str:
+    """Put of the trainer: `Run`."""
+    return f"{ROOT}/training/{run}/progress"
+
+
 def planner_alive(planner: str) -> str:
     """Liveliness token of a planner that is ready."""
     return f"{ROOT}/alive/planner/{planner}"
@@ -80,3 +100,18 @@ def checkpoint_announcement(model: str) -> str:
 def checkpoint_chunk(digest: str) -> str:
     """Queryable of the trainer: `CheckpointChunkRequest` to `CheckpointChunkResponse`."""
     return f"{ROOT}/checkpoint/{digest}/chunk"
+
+
+def checkpoint_list_versions(model: str) -> str:
+    """Queryable of the trainer: `ListVersionsRequest` to `ListVersionsResponse`."""
+    return f"{ROOT}/checkpoint/{model}/list_versions"
+
+
+def checkpoint_promote(model: str) -> str:
+    """Queryable of the trainer: `PromoteVersionRequest` to `PromoteVersionResponse`."""
+    return f"{ROOT}/checkpoint/{model}/promote"
+
+
+def checkpoint_roll_back(model: str) -> str:
+    """Queryable of the trainer: `RollBackRequest` to `RollBackResponse`."""
+    return f"{ROOT}/checkpoint/{model}/roll_back"

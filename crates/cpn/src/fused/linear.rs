@@ -35,11 +35,9 @@ impl<T: Real> Linear<T> {
     /// A layer of a `[outputs, inputs]` and b `[outputs]`.
     pub fn new(weight: Vec<T>, bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
-        let mut transposed = vec![T::ZERO; weight.len()];
-        for (o, row) in weight.chunks_exact(inputs).enumerate() {
-            for (i, value) in row.iter().enumerate() {
-                transposed[i * outputs + o] = *value;
-            }
+        let mut transposed = Vec::with_capacity(weight.len());
+        for i in 0..inputs {
+            transposed.extend(weight.iter().skip(i).step_by(inputs));
         }
         Self { inputs, outputs, weight, transposed, bias }
     }
@@ -110,14 +108,7 @@ pub fn add<T: Real>(sum: &mut [T], x: &[T]) {
 /// `c = a b`, added to what is in c if `accumulate`: c and b row-major, a with a stride along `inner` and one along its
 /// rows.
 #[allow(unsafe_code, reason = "the library takes pointers; that they stay inside the slices is checked here")]
-fn multiply<T: Real>(
-    accumulate: bool,
-    c: &mut [T],
-    a: &[T],
-    (a_inner, a_row): (usize, usize),
-    b: &[T],
-    inner: usize,
-) {
+fn multiply<T: Real>(accumulate: bool, c: &mut [T], a: &[T], (a_inner, a_row): (usize, usize), b: &[T], inner: usize) {
     let (rows, columns) = (a.len() / inner, b.len() / inner);
     let exact = a.len() == rows * inner && b.len() == inner * columns && c.len() == rows * columns;
     let dense = (a_inner, a_row) == (1, inner) || (a_inner, a_row) == (rows, 1);

@@ -26,7 +26,7 @@ mod network;
 mod outer;
 mod real;
 
-pub use linear::Weights;
+pub use linear::{Weights, add};
 pub use outer::Samples;
 pub use real::Real;
 
@@ -36,7 +36,7 @@ use outer::{Settings, Sums, Workspace};
 use rayon::prelude::*;
 
 /// R, the samples of a block.
-const BLOCK: usize = 32;
+const BLOCK: usize = 16;
 
 /// Room for ŝ and s̄ of a layer's gates.
 #[derive(Debug)]
@@ -114,8 +114,7 @@ impl<T: Real> OuterLoop<T> {
         let shares = x.par_chunks_mut(share * latent).zip(x_g.par_chunks_mut(share * latent));
         self.workers.par_iter_mut().zip(shares).enumerate().for_each(|(i, (worker, (x, x_g)))| {
             let sums = worker.sums.insert(Sums::zeros(&network));
-            let workspace =
-                worker.workspace.get_or_insert_with(|| Workspace::new(&network, BLOCK, horizon, updates));
+            let workspace = worker.workspace.get_or_insert_with(|| Workspace::new(&network, BLOCK, horizon, updates));
             let blocks = x.chunks_mut(BLOCK * latent).zip(x_g.chunks_mut(BLOCK * latent));
             for (block, (x, x_g)) in blocks.enumerate() {
                 let first = i * share + block * BLOCK;
@@ -123,10 +122,9 @@ impl<T: Real> OuterLoop<T> {
                 workspace.run(&network, settings, samples, (x, x_g), sums);
             }
         });
-        let mut sums = Sums::zeros(&network);
-        for part in self.workers.iter_mut().filter_map(|worker| worker.sums.take()) {
-            sums.add(part);
-        }
+        let mut parts = self.workers.iter_mut().filter_map(|worker| worker.sums.take());
+        let mut sums = parts.next().unwrap_or_else(|| Sums::zeros(&network));
+        parts.for_each(|part| sums.add(part));
         OuterGradient { loss: sums.loss, x, x_g, weights: sums.into_weights(updates > 0) }
     }
 }

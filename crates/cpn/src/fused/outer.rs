@@ -164,7 +164,14 @@ impl<T: Real> Workspace<T> {
     }
 
     /// Rollout k: along the policy's actions if it is the first, along the plan's otherwise.
-    fn roll_out(&mut self, network: &Network<T>, settings: Settings<T>, samples: Samples<'_, T>, rows: usize, k: usize) {
+    fn roll_out(
+        &mut self,
+        network: &Network<T>,
+        settings: Settings<T>,
+        samples: Samples<'_, T>,
+        rows: usize,
+        k: usize,
+    ) {
         let Self { rollouts, buffers, actions, x, .. } = self;
         let Rollout { steps, miss, .. } = &mut rollouts[k];
         let x = &mut x[..samples.x.len()];

@@ -130,8 +130,19 @@ macro_rules! real {
 
 impl Real for f64 {
     real!(
-        f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, as_mut_simd_f64s, partial_load_f64s, partial_store_f64s, add_f64s, sub_f64s, mul_f64s,
-        mul_add_f64s, reduce_sum_f64s
+        f64,
+        f64s,
+        F64_LANES,
+        splat_f64s,
+        as_simd_f64s,
+        as_mut_simd_f64s,
+        partial_load_f64s,
+        partial_store_f64s,
+        add_f64s,
+        sub_f64s,
+        mul_f64s,
+        mul_add_f64s,
+        reduce_sum_f64s
     );
 
     #[inline(always)]
@@ -145,8 +156,19 @@ impl Real for f64 {
 
 impl Real for f32 {
     real!(
-        f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, as_mut_simd_f32s, partial_load_f32s, partial_store_f32s, add_f32s, sub_f32s, mul_f32s,
-        mul_add_f32s, reduce_sum_f32s
+        f32,
+        f32s,
+        F32_LANES,
+        splat_f32s,
+        as_simd_f32s,
+        as_mut_simd_f32s,
+        partial_load_f32s,
+        partial_store_f32s,
+        add_f32s,
+        sub_f32s,
+        mul_f32s,
+        mul_add_f32s,
+        reduce_sum_f32s
     );
 
     #[inline(always)]

@@ -3,10 +3,11 @@
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
+use cpn::loss::Batch;
 use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::Tensor;
+use tch::{Device, Kind, Tensor};
 
 /// A model with few weights.
 pub fn small_config(method: MethodKind) -> ModelConfig {
@@ -47,4 +48,17 @@ pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let values: Vec<f64> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
     Tensor::from_slice(&values).view(shape)
+}
+
+/// A batch of observations, each with a goal of its own.
+pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Batch {
+    let count = observations.size()[0];
+    let rows = |first| Tensor::arange_start(first, first + count, (Kind::Int64, Device::Cpu));
+    Batch {
+        frames: Tensor::cat(&[observations, goals], 0),
+        observations: rows(0),
+        goals: rows(count),
+        actions: actions.shallow_clone(),
+        mask: mask.shallow_clone(),
+    }
 }

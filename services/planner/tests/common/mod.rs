@@ -186,6 +186,7 @@ pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
         observed: Some(proto::plan_request::Observed::Observation(image(seed))),
         seed,
         deadline_ms: 0,
+        model_digest: String::new(),
     }
 }
 
@@ -222,8 +223,13 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
     });
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
-    let provenance =
-        Provenance { training_tasks, data_digest: "d".into(), render_spec: render_spec.into(), seed, epochs: 1 };
+    let provenance = Provenance {
+        training_tasks,
+        data_digest: "d".repeat(64),
+        render_spec: render_spec.into(),
+        seed,
+        training: cpn::Training::paper(),
+    };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
 
@@ -233,10 +239,10 @@ pub fn position_checkpoint(seed: u64) -> Vec<u8> {
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, actions: 3, ..ModelConfig::paper(MethodKind::Cpn) };
     let provenance = Provenance {
         training_tasks: vec!["jenga-poke".into()],
-        data_digest: "d".into(),
+        data_digest: "d".repeat(64),
         render_spec: String::new(),
         seed,
-        epochs: 1,
+        training: cpn::Training::paper(),
     };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
@@ -250,6 +256,7 @@ pub fn position_request(model: &str) -> proto::PlanRequest {
         observed: Some(proto::plan_request::Observed::Position(hand)),
         seed: 0,
         deadline_ms: 0,
+        model_digest: String::new(),
     }
 }
 
@@ -351,6 +358,7 @@ pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
         digest: checkpoint::digest(name.as_bytes()),
         training_tasks: Vec::new(),
         horizon: 1,
+        version: 0,
     };
     core.serve(Model { info, render_spec: String::new(), method }).await.unwrap();
 }

@@ -2,7 +2,9 @@
 
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use cpn::images;
+use cpn::checkpoint::{self, Provenance};
+use cpn::config::{ConvConfig, ImageEncoderConfig};
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, images};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use recording::Episode;
@@ -15,6 +17,8 @@ use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpiso
 use wire::sim::Variation;
 use zenoh::Session;
 
+/// Of what every checkpoint says it was trained on.
+pub const DATA_DIGEST: &str = "dddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddd";
 /// How every frame says it was rendered.
 pub const SPEC: &str = r#"{"camera":"corner2"}"#;
 
@@ -67,6 +71,27 @@ pub fn commit(episode: &Episode) -> CommitEpisodeRequest {
 /// Keeps an episode in `folder`.
 pub fn keep(folder: &Path, episode: &Episode) {
     Recordings::open(folder.to_owned()).unwrap().keep(episode).unwrap();
+}
+
+/// A checkpoint of few, random weights.
+pub fn checkpoint(seed: u64) -> Vec<u8> {
+    let encoder = EncoderConfig::Image(ImageEncoderConfig {
+        convolutions: vec![
+            ConvConfig { channels: 3, kernel: 8, stride: 8 },
+            ConvConfig { channels: 4, kernel: 4, stride: 3 },
+        ],
+        latent: 6,
+        layer_norm: true,
+    });
+    let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(MethodKind::Cpn) };
+    let provenance = Provenance {
+        training_tasks: vec!["reach".into()],
+        data_digest: DATA_DIGEST.into(),
+        render_spec: String::new(),
+        seed,
+        training: cpn::Training::paper(),
+    };
+    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
 }
 
 /// A session that listens, and one that connects to it.

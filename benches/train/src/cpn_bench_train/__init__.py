@@ -1,0 +1,1 @@
+"""Training steps of the compared methods in PyTorch and JAX, and the turns they take with ours."""

@@ -1,0 +1,36 @@
+"""How a contender is asked to train: numbers of steps come in on stdin, what they took goes out as lines of JSON."""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+MAX_GRADIENT_NORM = 10.0
+LEARNING_RATE = 1e-3
+WARM_UP_STEPS = 5
+
+
+class Contender(Protocol):
+    """A model with its optimiser and its batches."""
+
+    def step(self, number: int) -> Callable[[], float]:
+        """Takes the training step of this number; the answer waits for it and tells the loss before the update."""
+        ...
+
+
+def serve(contender: Contender) -> None:
+    """Compiles and warms up, says so with the first loss, then trains as asked until stdin ends."""
+    first = contender.step(0)()
+    for number in range(1, WARM_UP_STEPS):
+        contender.step(number)()
+    print(json.dumps({"ready": True, "loss": first}), flush=True)
+    number = WARM_UP_STEPS
+    for line in sys.stdin:
+        start = time.perf_counter()
+        for _ in range(int(line) - 1):
+            contender.step(number)
+            number += 1
+        loss = contender.step(number)()
+        number += 1
+        print(json.dumps({"seconds": time.perf_counter() - start, "loss": loss}), flush=True)

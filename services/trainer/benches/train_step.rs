@@ -1,0 +1,182 @@
+//! Our side of `make bench-train`: writes the batches that everybody trains on, and trains on them when asked to.
+//!
+//! Numbers of steps come in on stdin, one a line; what they took goes out as a line of JSON. `stages` asks where the time
+//! of a step went, on average over all so far.
+
+#![expect(clippy::unwrap_used, reason = "a bench")]
+
+#[path = "../tests/common/mod.rs"]
+mod common;
+
+use clap::Parser;
+use cpn::archive::{self, Tensors};
+use cpn::loss::Precision;
+use cpn::{Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
+use serde_json::json;
+use std::io::{self, BufRead};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc;
+use std::thread;
+use std::time::Instant;
+use tch::Tensor;
+use trainer::dataset::{Dataset, Frames};
+use trainer::learner::{Learner, StageTimes};
+use trainer::sampler::Sampler;
+
+/// Distinct batches, over and over.
+const BATCHES: usize = 8;
+/// Demonstrations of noise, and their lengths: those of Meta-World's experts have 35 to 110 steps.
+const EPISODES: u64 = 32;
+const STEPS: u32 = 65;
+const LEARNING_RATE: f64 = 1e-3;
+const SEED: u64 = 0;
+
+#[derive(Parser)]
+struct Args {
+    /// Train on these batches.
+    #[arg(long, required_unless_present = "write_batches")]
+    batches: Option<PathBuf>,
+    /// Write batches, and the recordings they come from beside them.
+    #[arg(long)]
+    write_batches: Option<PathBuf>,
+    #[arg(long)]
+    method: String,
+    #[arg(long, default_value_t = 1)]
+    threads: usize,
+    #[arg(long)]
+    latent: Option<i64>,
+    #[arg(long)]
+    horizon: Option<i64>,
+    #[arg(long)]
+    updates: Option<i64>,
+    #[arg(long)]
+    batch: Option<usize>,
+    /// What `cargo bench` says.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+fn main() {
+    let args = Args::parse();
+    match (&args.write_batches, &args.batches) {
+        (Some(path), _) => write(path, &args),
+        (None, Some(path)) => train(path, args.threads),
+        (None, None) => unreachable!("clap wants one"),
+    }
+}
+
+/// The recipe of our own CPN for any method and size.
+fn recipe(args: &Args) -> Recipe {
+    let method = MethodKind::ALL.into_iter().find(|method| method.name() == args.method).expect("a learned method");
+    let Recipe { mut training, .. } = Preset::Cpn.recipe();
+    training.batch_size = args.batch.unwrap_or(training.batch_size);
+    let mut model = ModelConfig::paper(method);
+    model.horizon = args.horizon.unwrap_or(model.horizon);
+    model.updates = args.updates.unwrap_or(model.updates);
+    if let cpn::EncoderConfig::Image(encoder) = &mut model.encoder {
+        encoder.latent = args.latent.unwrap_or(encoder.latent);
+    }
+    let recipe = Recipe { model, training };
+    recipe.validate().unwrap();
+    recipe
+}
+
+fn recordings(batches: &Path) -> PathBuf {
+    batches.with_extension("recordings")
+}
+
+fn write(path: &Path, args: &Args) {
+    let recipe = recipe(args);
+    let folder = recordings(path);
+    for seed in 0..EPISODES {
+        common::keep(&folder, &common::episode("noise", seed, STEPS));
+    }
+    let dataset = Dataset::load(&folder, &[], Input::Image).unwrap();
+    let sampler = Sampler::new(&dataset, &recipe, SEED);
+    let Frames::Pixels(pixels) = dataset.frames() else { panic!("expected images") };
+    let samples: Vec<_> =
+        (0..).flat_map(|epoch| sampler.epoch(epoch)).take(BATCHES * recipe.training.batch_size).collect();
+    let index = |step: fn(&trainer::sampler::Sample) -> u32| {
+        let frame = |sample| dataset.episodes()[sample_episode(sample)].first_frame + step(sample) as usize;
+        let indices: Vec<i64> = samples.iter().map(|sample| frame(sample) as i64).collect();
+        Tensor::from_slice(&indices).view([BATCHES as i64, -1])
+    };
+    let made: Vec<_> = samples.chunks(recipe.training.batch_size).map(|samples| sampler.batch(0, samples)).collect();
+    let stack = |part: fn(&cpn::loss::Batch) -> &Tensor| Tensor::stack(&made.iter().map(part).collect::<Vec<_>>(), 0);
+    let mut tensors = Tensors::from([
+        ("frames".to_owned(), images::from_bytes(pixels).unwrap()),
+        ("observation_index".to_owned(), index(|sample| sample.step)),
+        ("goal_index".to_owned(), index(|sample| sample.goal)),
+        ("actions".to_owned(), stack(|batch| &batch.actions)),
+        ("mask".to_owned(), stack(|batch| &batch.mask)),
+    ]);
+    let learner = Learner::new(&recipe, SEED, 1);
+    let weights = learner.agent.variables().variables().into_iter();
+    tensors.extend(weights.map(|(name, weight)| (format!("weight.{name}"), weight)));
+    std::fs::write(path, archive::to_bytes(&tensors, &recipe.model).unwrap()).unwrap();
+    std::fs::write(path.with_extension("recipe.json"), serde_json::to_string(&recipe).unwrap()).unwrap();
+}
+
+fn sample_episode(sample: &trainer::sampler::Sample) -> usize {
+    sample.episode as usize
+}
+
+fn train(path: &Path, threads: usize) {
+    tch::set_num_threads(threads as i32);
+    let recipe: Recipe =
+        serde_json::from_str(&std::fs::read_to_string(path.with_extension("recipe.json")).unwrap()).unwrap();
+    let (tensors, _): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
+    let weights: Tensors =
+        tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t))).collect();
+    let learner = |precision| {
+        let training = Training { precision, ..recipe.training.clone() };
+        let learner = Learner::new(&Recipe { model: recipe.model.clone(), training }, SEED, threads);
+        checkpoint::copy_weights(&weights, &learner.agent).unwrap();
+        learner
+    };
+    let dataset = Dataset::load(&recordings(path), &[], Input::Image).unwrap();
+    let sampler = Sampler::new(&dataset, &recipe, SEED);
+    thread::scope(|scope| {
+        let (sender, batches) = mpsc::sync_channel(1);
+        // As in a run: batches are made while the last one is computed with.
+        scope.spawn(move || {
+            let over_and_over = std::iter::repeat_with(|| sampler.batches(0).take(BATCHES)).flatten();
+            let _ = { over_and_over }.try_for_each(|batch| sender.send(batch));
+        });
+        // The loss before any update, in the others' precision; then everything is made warm.
+        let first = batches.recv().unwrap();
+        let loss = learner(Precision::Float32).step(&first, LEARNING_RATE).unwrap().loss;
+        let mut learner = learner(recipe.training.precision);
+        for batch in batches.iter().take(BATCHES - 1) {
+            learner.step(&batch, LEARNING_RATE).unwrap();
+        }
+        println!("{}", json!({"ready": true, "loss": loss}));
+        let (mut stages, mut steps) = (StageTimes::default(), 0);
+        for line in io::stdin().lock().lines() {
+            let line = line.unwrap();
+            if line.trim() == "stages" {
+                let mean = |seconds: f64| seconds / f64::from(steps);
+                println!(
+                    "{}",
+                    json!({"stages": {
+                        "encoder": mean(stages.encoder_seconds),
+                        "inner and outer loop": mean(stages.outer_loop_seconds),
+                        "optimiser": mean(stages.optimiser_seconds),
+                    }})
+                );
+                continue;
+            }
+            let (count, started, mut loss) = (line.trim().parse().unwrap(), Instant::now(), f64::NAN);
+            for batch in batches.iter().take(count) {
+                let learnt = learner.step(&batch, LEARNING_RATE).unwrap();
+                loss = learnt.loss;
+                stages.encoder_seconds += learnt.times.encoder_seconds;
+                stages.outer_loop_seconds += learnt.times.outer_loop_seconds;
+                stages.optimiser_seconds += learnt.times.optimiser_seconds;
+            }
+            steps += count as u32;
+            println!("{}", json!({"seconds": started.elapsed().as_secs_f64(), "loss": loss}));
+        }
+        drop(batches);
+    });
+}

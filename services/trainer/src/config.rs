@@ -1,0 +1,109 @@
+//! What a training run can be told.
+
+use anyhow::Context;
+use cpn::{ModelConfig, Preset, Recipe, Training};
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use figment::value::Value;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// How the names of environment variables begin.
+const PREFIX: &str = "CPN_TRAIN_";
+
+/// Valid settings of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Where model and training come from, as far as nothing else is said of them.
+    pub preset: Preset,
+    /// What is trained.
+    pub model: ModelConfig,
+    /// How.
+    pub training: Training,
+    /// Folder of the demonstrations.
+    pub dataset: PathBuf,
+    /// Where the checkpoint goes.
+    pub out: PathBuf,
+    /// Tasks that the model must not see.
+    pub hold_out: Vec<String>,
+    /// Seed of initialisation and sampling.
+    pub seed: u64,
+    /// Threads that compute. The order of sums depends on their number, and with it the last bits of the weights.
+    pub threads: usize,
+    /// How often the run saves its state; 0 is after each step.
+    pub save_interval_seconds: f64,
+    /// Where the run keeps its progress, events and curve; `runs/training/` and the stem of `out` if none is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub run_dir: Option<PathBuf>,
+}
+
+impl From<Preset> for Config {
+    fn from(preset: Preset) -> Self {
+        let Recipe { model, training } = preset.recipe();
+        Self {
+            preset,
+            model,
+            training,
+            dataset: "data/demonstrations".into(),
+            out: format!("runs/checkpoints/{}.safetensors", preset.name()).into(),
+            hold_out: Vec::new(),
+            seed: 0,
+            threads: 1,
+            save_interval_seconds: 60.0,
+            run_dir: None,
+        }
+    }
+}
+
+impl Config {
+    /// Reads settings in layers: `changes`, each `key=value`, over what was typed over the environment over a file over the
+    /// preset, which any of them may name.
+    ///
+    /// # Errors
+    /// Names the field, what was expected and what came.
+    pub fn load(file: Option<&Path>, arguments: &impl Serialize, changes: &[String]) -> anyhow::Result<Self> {
+        let mut layers = Figment::new();
+        if let Some(file) = file {
+            layers = layers.merge(Toml::file_exact(file));
+        }
+        layers = layers.merge(Env::prefixed(PREFIX).split("__")).merge(Serialized::defaults(arguments));
+        for change in changes {
+            let (key, value) = change.split_once('=').with_context(|| format!("expected key=value, got {change:?}"))?;
+            let value: Value = value.parse().with_context(|| change.clone())?;
+            layers = layers.merge((key, value));
+        }
+        Self::over_preset(layers)
+    }
+
+    /// Reads settings as they stand in a file.
+    ///
+    /// # Errors
+    /// Names the field, what was expected and what came.
+    pub fn from_toml(text: &str) -> anyhow::Result<Self> {
+        Self::over_preset(Figment::from(Toml::string(text)))
+    }
+
+    /// The settings of the preset that some settings name, and these over them.
+    fn over_preset(settings: Figment) -> anyhow::Result<Self> {
+        let preset = if settings.contains("preset") { settings.extract_inner("preset")? } else { Preset::Cpn };
+        let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(settings).extract()?;
+        config.recipe().validate()?;
+        Ok(config)
+    }
+
+    /// The run's name: the stem of its checkpoint's file.
+    pub fn name(&self) -> String {
+        self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// Where the run keeps its progress, events and curve.
+    pub fn run_dir(&self) -> PathBuf {
+        self.run_dir.clone().unwrap_or_else(|| Path::new("runs/training").join(self.name()))
+    }
+
+    /// What is trained, and how.
+    pub fn recipe(&self) -> Recipe {
+        Recipe { model: self.model.clone(), training: self.training.clone() }
+    }
+}

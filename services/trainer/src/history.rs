@@ -1,0 +1,177 @@
+//! The versions of one model, in a folder of their own: the weights of each, named by their digest, and `history.json`,
+//! which says what they are. A version is there once the history says so: weights that it does not name are what a killed
+//! process, or a version that went, left behind.
+
+use anyhow::{Context, ensure};
+use serde::{Deserialize, Serialize};
+use service_kit::files;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+use tracing::warn;
+use wire::checkpoint::{CheckpointAnnouncement, CheckpointManifest};
+use wire::{Code, Error};
+
+/// How the names of checkpoints end.
+const EXTENSION: &str = "safetensors";
+/// Says what the versions of a model are.
+const HISTORY: &str = "history.json";
+
+/// The versions of one model.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct History {
+    /// Oldest first.
+    versions: Vec<CheckpointManifest>,
+    /// In the order in which they were promoted last; the last one is promoted.
+    promotions: Vec<u32>,
+    /// When that was; greater at every promotion, whatever the clock says.
+    promoted_unix_nanos: u64,
+}
+
+impl History {
+    /// Reads a model's history, without the versions whose weights are gone or damaged, and removes what belongs to none;
+    /// none if no version is left.
+    ///
+    /// # Errors
+    /// If the history cannot be read, is malformed, or is that of another model.
+    pub(crate) fn read(folder: &Path) -> anyhow::Result<Option<Self>> {
+        files::remove_unfinished(folder)?;
+        let mut history = match std::fs::read(folder.join(HISTORY)) {
+            Err(e) if e.kind() == ErrorKind::NotFound => Self::default(),
+            json => serde_json::from_slice(&json?).context(HISTORY)?,
+        };
+        let expected = folder.file_name().and_then(|name| name.to_str()).context("a folder with a name")?;
+        for CheckpointManifest { model, .. } in &history.versions {
+            ensure!(model == expected, "model: expected {expected:?}, got {model:?}");
+        }
+        for manifest in std::mem::take(&mut history.versions) {
+            let manifest = valid(manifest)?;
+            let got = digest(&weights(folder, &manifest.digest))?;
+            if got.as_ref() == Some(&manifest.digest) {
+                history.versions.push(manifest);
+            } else {
+                let CheckpointManifest { model, version, digest, .. } = manifest;
+                warn!(
+                    model,
+                    version,
+                    expected = digest,
+                    ?got,
+                    "version passed over: its weights are not what they were"
+                );
+            }
+        }
+        let before = history.promotions.last().copied();
+        history.forget_lost_promotions();
+        let last = history.versions.last().map(|manifest| manifest.version);
+        match history.promotions.last().copied().or(last) {
+            Some(promoted) if before != Some(promoted) => history.promote(promoted),
+            _ => {}
+        }
+        history.sweep(folder);
+        Ok((!history.versions.is_empty()).then_some(history))
+    }
+
+    /// Writes the history; what it says holds from then on. Then removes what no version has any more.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<()> {
+        files::write_atomically(&folder.join(HISTORY), &serde_json::to_vec_pretty(self)?)?;
+        self.sweep(folder);
+        Ok(())
+    }
+
+    /// Of every version, oldest first.
+    pub(crate) fn manifests(&self) -> &[CheckpointManifest] {
+        &self.versions
+    }
+
+    /// The promoted version.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub(crate) fn promoted(&self) -> Result<&CheckpointManifest, Error> {
+        let promoted = self.promotions.last();
+        let manifest = self.versions.iter().find(|manifest| Some(&manifest.version) == promoted);
+        manifest.ok_or_else(|| Error::new(Code::Internal, "promotions", "a version", "none"))
+    }
+
+    /// What planners are to be told.
+    ///
+    /// # Errors
+    /// If no version is promoted.
+    pub(crate) fn announcement(&self) -> Result<CheckpointAnnouncement, Error> {
+        let manifest = self.promoted()?.clone();
+        Ok(CheckpointAnnouncement { manifest, promoted_unix_nanos: self.promoted_unix_nanos })
+    }
+
+    /// Adds a version, promotes it, and forgets all but the last `keep`.
+    pub(crate) fn add(&mut self, manifest: CheckpointManifest, keep: usize) {
+        self.promote(manifest.version);
+        self.versions.push(manifest);
+        self.versions.drain(..self.versions.len().saturating_sub(keep));
+        self.forget_lost_promotions();
+    }
+
+    /// Promotes the version that was promoted before the one that is; false if there is none.
+    pub(crate) fn roll_back(&mut self) -> bool {
+        self.promotions.pop();
+        let before = self.promotions.last().copied();
+        before.map(|before| self.promote(before)).is_some()
+    }
+
+    /// Promotes a version that is kept.
+    pub(crate) fn promote(&mut self, version: u32) {
+        self.promotions.retain(|promoted| *promoted != version);
+        self.promotions.push(version);
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+        let now = u64::try_from(now).unwrap_or(u64::MAX);
+        self.promoted_unix_nanos = now.max(self.promoted_unix_nanos.saturating_add(1));
+    }
+
+    fn forget_lost_promotions(&mut self) {
+        let versions = &self.versions;
+        self.promotions.retain(|promoted| versions.iter().any(|manifest| manifest.version == *promoted));
+    }
+
+    /// Removes weights that no version has.
+    fn sweep(&self, folder: &Path) {
+        let sweep = || {
+            for entry in std::fs::read_dir(folder)? {
+                let path = entry?.path();
+                let digest = stem(&path);
+                if digest.is_some_and(|digest| self.versions.iter().all(|manifest| manifest.digest != digest)) {
+                    std::fs::remove_file(path)?;
+                }
+            }
+            std::io::Result::Ok(())
+        };
+        if let Err(error) = sweep() {
+            warn!(folder = %folder.display(), %error, "old weights not removed");
+        }
+    }
+}
+
+/// `cpn` for `cpn.safetensors`; none for any other file.
+pub(crate) fn stem(path: &Path) -> Option<String> {
+    (path.extension()? == EXTENSION).then(|| path.file_stem()?.to_str().map(str::to_owned))?
+}
+
+/// Where the weights of a digest are.
+pub(crate) fn weights(folder: &Path, digest: &str) -> PathBuf {
+    folder.join(format!("{digest}.{EXTENSION}"))
+}
+
+/// The digest of a checkpoint's file; none if there is no such file.
+fn digest(path: &Path) -> anyhow::Result<Option<String>> {
+    match files::read_at_most(path, cpn::checkpoint::MAX_BYTES) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(None),
+        bytes => Ok(Some(cpn::checkpoint::digest(&bytes.with_context(|| path.display().to_string())?))),
+    }
+}
+
+/// A manifest as it comes out of a message: the trip through the wire applies the same rules to it.
+pub(crate) fn valid(manifest: CheckpointManifest) -> Result<CheckpointManifest, Error> {
+    wire::decode(&wire::encode(manifest))
+}

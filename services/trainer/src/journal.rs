@@ -1,0 +1,161 @@
+//! What a run leaves in its folder: `progress.jsonl`, a TensorBoard event file with the same values, and `curve.svg`.
+
+use crate::curve;
+use crate::progress::{Observer, Progress, ends_epoch};
+use anyhow::Context;
+use serde::{Deserialize, Serialize};
+use service_kit::files;
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+use tfrecord::protobuf::event::What;
+use tfrecord::protobuf::session_log::SessionStatus;
+use tfrecord::protobuf::{Event, SessionLog};
+use tfrecord::{EventMeta, EventWriter};
+
+/// Most steps of a run that are noted, besides the last of each epoch.
+const MAX_NOTED: u64 = 1000;
+/// Name of the file with a line for each noted step.
+const PROGRESS: &str = "progress.jsonl";
+/// How the names of TensorBoard's files begin.
+const EVENTS: &str = "events.out.tfevents.";
+/// Name of the file that the run has locked.
+const LOCK: &str = ".lock";
+
+/// A line of `progress.jsonl`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Entry {
+    /// When the step was done.
+    pub unix_seconds: f64,
+    /// How far the run was then.
+    #[serde(flatten)]
+    pub progress: Progress,
+}
+
+/// Notes the progress of a run in its folder. The lines are the record; events and curve are made of them.
+#[derive(Debug)]
+pub struct Journal {
+    folder: PathBuf,
+    name: String,
+    /// Held as long as this lives: two processes would each note a part.
+    _lock: File,
+    entries: Vec<Entry>,
+    open: Option<Open>,
+}
+
+/// The files that grow.
+#[derive(Debug)]
+struct Open {
+    lines: File,
+    events: EventWriter<File>,
+}
+
+impl Journal {
+    /// The journal in a folder, of a run of this name.
+    ///
+    /// # Errors
+    /// If the folder cannot be made, or another process has it.
+    pub fn open(folder: PathBuf, name: String) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+        let lock = File::create(folder.join(LOCK)).with_context(|| folder.display().to_string())?;
+        lock.try_lock().with_context(|| format!("{}: expected a folder that no run has", folder.display()))?;
+        files::remove_unfinished(&folder)?;
+        Ok(Self { folder, name, _lock: lock, entries: Vec::new(), open: None })
+    }
+
+    fn draw(&self) -> anyhow::Result<()> {
+        files::write_atomically(&self.folder.join("curve.svg"), curve::draw(&self.name, &self.entries)?.as_bytes())
+    }
+}
+
+impl Observer for Journal {
+    /// Drops what was noted of steps that will be done again.
+    fn begin(&mut self, step: u64) -> anyhow::Result<()> {
+        self.entries = read(&self.folder)?;
+        self.entries.retain(|entry| entry.progress.step <= step);
+        let path = self.folder.join(PROGRESS);
+        let lines = self.entries.iter().map(line).collect::<serde_json::Result<Vec<_>>>()?;
+        files::write_atomically(&path, &lines.concat())?;
+        let lines = OpenOptions::new().append(true).open(&path).with_context(|| path.display().to_string())?;
+        self.open = Some(Open { lines, events: begin_events(&self.folder, &self.entries)? });
+        Ok(())
+    }
+
+    fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
+        let every = progress.steps.div_ceil(MAX_NOTED);
+        if !progress.step.is_multiple_of(every) && !ends_epoch(progress) {
+            return Ok(());
+        }
+        let entry = Entry { unix_seconds: unix_seconds(), progress: *progress };
+        let open = self.open.as_mut().context("a journal that has begun")?;
+        open.lines.write_all(&line(&entry)?).with_context(|| self.folder.join(PROGRESS).display().to_string())?;
+        write_events(&mut open.events, &entry)?;
+        self.entries.push(entry);
+        if ends_epoch(progress) { self.draw() } else { Ok(()) }
+    }
+}
+
+/// What is noted in a folder; a line that was cut by a crash, and what follows it, is not.
+///
+/// # Errors
+/// If the file is there and cannot be read.
+pub fn read(folder: &Path) -> anyhow::Result<Vec<Entry>> {
+    let path = folder.join(PROGRESS);
+    match std::fs::read_to_string(&path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Vec::new()),
+        text => Ok(text
+            .with_context(|| path.display().to_string())?
+            .lines()
+            .map_while(|line| serde_json::from_str(line).ok())
+            .collect()),
+    }
+}
+
+fn line(entry: &Entry) -> serde_json::Result<Vec<u8>> {
+    let mut line = serde_json::to_vec(entry)?;
+    line.push(b'\n');
+    Ok(line)
+}
+
+/// A new event file with what is known, in place of the old ones.
+fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<File>> {
+    let old = std::fs::read_dir(folder)?.collect::<Result<Vec<_>, _>>()?;
+    let old: Vec<_> = old.iter().filter(|file| file.file_name().to_string_lossy().starts_with(EVENTS)).collect();
+    // The name grows, so that a TensorBoard that is open goes on to this file.
+    let path = folder.join(format!("{EVENTS}{:.6}.{}", unix_seconds(), std::process::id()));
+    let mut events = EventWriter::from_writer(File::create_new(&path)?, Default::default())?;
+    events.write_event(event(What::FileVersion("brain.Event:2".into())))?;
+    // It forgets then what it has read of the old ones.
+    let start = SessionLog { status: SessionStatus::Start.into(), ..Default::default() };
+    events.write_event(event(What::SessionLog(start)))?;
+    for entry in entries {
+        write_events(&mut events, entry)?;
+    }
+    for file in old {
+        std::fs::remove_file(file.path())?;
+    }
+    Ok(events)
+}
+
+fn event(what: What) -> Event {
+    Event { what: Some(what), ..EventMeta::new(0, unix_seconds()).build_empty() }
+}
+
+fn write_events(events: &mut EventWriter<File>, entry: &Entry) -> anyhow::Result<()> {
+    let Progress { step, loss, learning_rate, gradient_norm, samples_per_second, .. } = entry.progress;
+    let meta = EventMeta::new(i64::try_from(step)?, entry.unix_seconds);
+    for (tag, value) in [
+        ("train/loss", loss),
+        ("train/learning_rate", learning_rate),
+        ("train/gradient_norm", gradient_norm),
+        ("train/samples_per_second", samples_per_second),
+    ] {
+        events.write_scalar(tag, meta.clone(), value as f32)?;
+    }
+    Ok(())
+}
+
+fn unix_seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}

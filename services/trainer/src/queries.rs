@@ -1,0 +1,39 @@
+//! Queryables whose answers may take their time.
+
+use std::sync::Arc;
+use tokio::runtime::Handle;
+use tokio::sync::Semaphore;
+use tracing::warn;
+use wire::{Code, Error, query};
+use zenoh::Session;
+use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::query::{Query, Queryable};
+
+/// Queries of one kind that are answered or wait for it at the same time; each holds an episode at most.
+const PLACES: usize = 16;
+
+/// Answers queries on threads that may read and write files; zenoh's callback only starts them. Services hold
+/// different things, so none is complete.
+pub(crate) async fn serve(
+    session: &Session,
+    key: OwnedKeyExpr,
+    answer: impl Fn(&Query) -> zenoh::Result<()> + Send + Sync + 'static,
+) -> zenoh::Result<Queryable<()>> {
+    let (places, runtime, answer) = (Arc::new(Semaphore::new(PLACES)), Handle::current(), Arc::new(answer));
+    let callback = move |query: Query| {
+        let (place, answer) = (Arc::clone(&places).try_acquire_owned(), Arc::clone(&answer));
+        runtime.spawn_blocking(move || {
+            let answered = match place {
+                Ok(_place) => answer(&query),
+                Err(_) => {
+                    let got = format!("{PLACES} waiting");
+                    query::refuse(&query, Error::new(Code::ResourceExhausted, "queue", "a free place", got))
+                }
+            };
+            if let Err(error) = answered {
+                warn!(key = %query.key_expr(), %error, "answer not sent");
+            }
+        });
+    };
+    session.declare_queryable(key).callback(callback).await
+}

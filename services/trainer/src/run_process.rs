@@ -1,0 +1,136 @@
+//! The process of a training run: starting it, hearing of its progress, stopping it.
+
+use crate::progress::Progress;
+use crate::train::Outcome;
+use futures::StreamExt;
+use rustix::process::{Pid, Signal, kill_process};
+use serde::Deserialize;
+use std::fs::OpenOptions;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+use tokio::process::Command;
+use tokio_util::codec::{FramedRead, LinesCodec};
+use tokio_util::sync::CancellationToken;
+use tracing::warn;
+use wire::training::MAX_REASON_BYTES;
+
+/// How long a run may take to save its state.
+const GRACE: Duration = Duration::from_secs(30);
+/// Longest line that a run prints.
+const MAX_LINE_BYTES: usize = 4096;
+/// How the names of variables begin that would override a run's settings.
+const VARIABLES: &str = "CPN_TRAIN_";
+
+/// How a process ended.
+#[derive(Debug)]
+pub(crate) enum End {
+    /// The checkpoint of this digest is written.
+    Finished { digest: String },
+    /// Its state is saved.
+    Saved,
+    /// It was killed, for it did not save its state in time.
+    Killed,
+    /// By itself.
+    Failed { reason: String },
+}
+
+/// What a run prints.
+#[derive(Debug, Deserialize)]
+#[serde(untagged)]
+enum Line {
+    Progress(Progress),
+    Outcome(Outcome),
+}
+
+/// Runs `cpn-trainer train` with the settings of a file until it ends, or `stop` says so; what it logs is added to `log`.
+pub(crate) async fn run(
+    program: &Path,
+    settings: &Path,
+    log: &Path,
+    stop: &CancellationToken,
+    hear: impl FnMut(Progress),
+) -> End {
+    let run = async {
+        let stderr = OpenOptions::new().create(true).append(true).open(log)?;
+        let mut command = Command::new(program);
+        for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with(VARIABLES)) {
+            command.env_remove(name);
+        }
+        command.arg("train").arg("--json").arg("--config").arg(settings);
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).kill_on_drop(true);
+        attend(command, stop, hear).await
+    };
+    match run.await {
+        Ok((_, Some(Outcome::Finished { digest }), _)) => End::Finished { digest },
+        Ok((status, Some(Outcome::Interrupted { .. }), _)) if status.success() => End::Saved,
+        Ok((_, _, true)) => End::Killed,
+        Ok((status, ..)) => End::Failed { reason: reason(status, log) },
+        Err(error) => End::Failed { reason: format!("{}: {error}", program.display()) },
+    }
+}
+
+/// How the process ended, what it said of that, and whether it was killed.
+async fn attend(
+    mut command: Command,
+    stop: &CancellationToken,
+    mut hear: impl FnMut(Progress),
+) -> std::io::Result<(ExitStatus, Option<Outcome>, bool)> {
+    let mut child = command.spawn()?;
+    let id = child.id().and_then(|id| Pid::from_raw(id.cast_signed()));
+    let mut lines =
+        child.stdout.take().map(|out| FramedRead::new(out, LinesCodec::new_with_max_length(MAX_LINE_BYTES)));
+    let ended = async {
+        let mut outcome = None;
+        while let Some(lines) = &mut lines
+            && let Some(Ok(line)) = lines.next().await
+        {
+            match serde_json::from_str(&line) {
+                Ok(Line::Progress(progress)) => hear(progress),
+                Ok(Line::Outcome(said)) => outcome = Some(said),
+                Err(error) => warn!(line, %error, "line of a run passed over"),
+            }
+        }
+        child.wait().await.map(|status| (status, outcome))
+    };
+    tokio::pin!(ended);
+    // As long as it has not been waited for, its id is not another's.
+    let send = |signal| {
+        if let Some(Err(error)) = id.map(|id| kill_process(id, signal)) {
+            warn!(%error, "signal not sent to a run");
+        }
+    };
+    let mut killed = false;
+    let ended = tokio::select! {
+        ended = &mut ended => ended,
+        () = stop.cancelled() => {
+            send(Signal::TERM);
+            match tokio::time::timeout(GRACE, &mut ended).await {
+                Ok(ended) => ended,
+                Err(_) => {
+                    killed = true;
+                    send(Signal::KILL);
+                    ended.await
+                }
+            }
+        }
+    };
+    ended.map(|(status, outcome)| (status, outcome, killed))
+}
+
+/// Why a process failed: its status, and the end of its log.
+fn reason(status: ExitStatus, log: &Path) -> String {
+    let tail = || {
+        let mut file = std::fs::File::open(log)?;
+        let start = file.metadata()?.len().saturating_sub(MAX_REASON_BYTES as u64 / 2);
+        file.seek(SeekFrom::Start(start))?;
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        std::io::Result::Ok(bytes)
+    };
+    let tail = tail().unwrap_or_default();
+    let mut reason = format!("{status}\n{}", String::from_utf8_lossy(&tail).trim());
+    reason.truncate(reason.floor_char_boundary(MAX_REASON_BYTES));
+    reason
+}

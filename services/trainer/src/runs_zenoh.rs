@@ -1,0 +1,69 @@
+//! Training runs over zenoh: queryables, and what is published of each run.
+
+use crate::queries::serve;
+use crate::runs::Runs;
+use anyhow::{anyhow, ensure};
+use tokio::runtime::Handle;
+use tokio_util::task::AbortOnDropHandle;
+use tracing::warn;
+use wire::training::{
+    ListRunsRequest, ListRunsResponse, StartRunRequest, StartRunResponse, StopRunRequest, StopRunResponse,
+};
+use wire::{encode, key, query};
+use zenoh::Session;
+use zenoh::query::{Query, Queryable};
+
+/// What answers and publishes; it stops when this is dropped.
+#[derive(Debug)]
+pub(crate) struct RunsZenoh {
+    _queryables: [Queryable<()>; 3],
+    _publisher: AbortOnDropHandle<()>,
+}
+
+/// Answers for the trainer of this name, and publishes each change of a run.
+///
+/// # Errors
+/// If the name cannot stand in a key, or zenoh refuses a declaration.
+pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow::Result<RunsZenoh> {
+    let key = key::trainer_start_run(name)?;
+    ensure!(!key.is_wild(), "name: expected that of one trainer, got {name:?}");
+    let zenoh = |e: zenoh::Error| anyhow!(e);
+    let core = runs.clone();
+    let start = move |query: &Query| {
+        let answer = query::request(query).and_then(|request: StartRunRequest| core.start(&request));
+        query::reply(query, answer.map(|run| StartRunResponse { run }))
+    };
+    let (core, runtime) = (runs.clone(), Handle::current());
+    let stop = move |query: &Query| {
+        let stop = |request: StopRunRequest| runtime.block_on(core.stop(&request.name));
+        query::reply(query, query::request(query).and_then(stop).map(|run| StopRunResponse { run }))
+    };
+    let core = runs.clone();
+    let list = move |query: &Query| {
+        let answer = query::request(query).map(|_: ListRunsRequest| ListRunsResponse { runs: core.list() });
+        query::reply(query, answer)
+    };
+    let queryables = [
+        serve(session, key, start).await.map_err(zenoh)?,
+        serve(session, key::trainer_stop_run(name)?, stop).await.map_err(zenoh)?,
+        serve(session, key::trainer_list_runs(name)?, list).await.map_err(zenoh)?,
+    ];
+    let publisher = AbortOnDropHandle::new(tokio::spawn(publish(session.clone(), runs.clone())));
+    Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
+}
+
+async fn publish(session: Session, runs: Runs) {
+    let mut changes = runs.changes();
+    while let Some(changed) = changes.next().await {
+        for run in changed {
+            let name = run.name.clone();
+            let put = async {
+                let key = key::training_progress(&name)?;
+                session.put(key, encode(run)).encoding(query::encoding::<wire::proto::Run>()).await
+            };
+            if let Err(error) = put.await {
+                warn!(run = name, %error, "progress not published");
+            }
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! The published versions of every model, in the folder that training runs write their checkpoints to.
+//!
+//! `<model>.safetensors` is what a run wrote last; `versions/<model>` is the model's history.
+
+use crate::history::{self, History};
+use anyhow::Context;
+use service_kit::files;
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::num::NonZeroU16;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use tokio::sync::watch;
+use tracing::{info, warn};
+use wire::checkpoint::{
+    CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse, CheckpointManifest, CheckpointVersion,
+    ListVersionsRequest, ListVersionsResponse, PromoteVersionRequest, PromoteVersionResponse, RollBackRequest,
+    RollBackResponse,
+};
+use wire::{Code, Error};
+
+/// Folder of the versions.
+const VERSIONS: &str = "versions";
+
+/// The versions that one process keeps. Every method may block.
+#[derive(Debug)]
+pub struct Versions {
+    /// Where training runs write.
+    checkpoints: PathBuf,
+    keep: usize,
+    /// Held as long as this lives.
+    _lock: File,
+    /// By model, each with a version at least. Held until a change is on disk.
+    histories: Mutex<BTreeMap<String, History>>,
+    /// The files that were taken in or refused, by model.
+    seen: Mutex<HashMap<String, Stamp>>,
+    promoted: watch::Sender<BTreeMap<String, CheckpointAnnouncement>>,
+}
+
+/// Tells apart what a file was before and after it was written: its inode, and when that changed.
+type Stamp = (u64, i64, i64);
+
+impl Versions {
+    /// Takes over a folder, which is made if there is none; of each model at least the last `keep` versions will be kept.
+    ///
+    /// # Errors
+    /// If the folder cannot be made or read, another process has it, or a history in it is malformed.
+    pub fn open(checkpoints: PathBuf, keep: NonZeroU16) -> anyhow::Result<Self> {
+        let folder = checkpoints.join(VERSIONS);
+        let lock = files::take_over(&folder)?;
+        let mut histories = BTreeMap::new();
+        for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
+            let folder = entry?.path();
+            if folder.is_dir()
+                && let Some(history) = History::read(&folder).with_context(|| folder.display().to_string())?
+            {
+                histories.insert(history.promoted()?.model.clone(), history);
+            }
+        }
+        let promoted = histories.iter().map(|(model, history)| Ok((model.clone(), history.announcement()?)));
+        let promoted = watch::Sender::new(promoted.collect::<Result<_, Error>>()?);
+        let (histories, seen) = (Mutex::new(histories), Mutex::default());
+        Ok(Self { checkpoints, keep: keep.get().into(), _lock: lock, histories, seen, promoted })
+    }
+
+    /// What planners are to serve, by model.
+    pub fn promoted(&self) -> watch::Receiver<BTreeMap<String, CheckpointAnnouncement>> {
+        self.promoted.subscribe()
+    }
+
+    /// Publishes every checkpoint that was written since the last time. One that is faulty is passed over, with its reason
+    /// in the log, until it is written anew.
+    ///
+    /// # Errors
+    /// If the folder cannot be read.
+    pub fn take_in(&self) -> anyhow::Result<()> {
+        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        for entry in std::fs::read_dir(&self.checkpoints).with_context(|| self.checkpoints.display().to_string())? {
+            let path = entry?.path();
+            // Before the file is read: if it is replaced in between, it is looked at once more.
+            let (Some(model), Ok(metadata)) = (history::stem(&path), path.metadata()) else { continue };
+            let stamp = (metadata.ino(), metadata.ctime(), metadata.ctime_nsec());
+            if seen.get(&model) == Some(&stamp) {
+                continue;
+            }
+            // One byte more than a checkpoint may have, so that it is refused as too large.
+            let bytes = files::read_at_most(&path, cpn::checkpoint::MAX_BYTES + 1)
+                .map_err(|e| Error::invalid("checkpoint", "a file that can be read", e));
+            let published = bytes.and_then(|bytes| self.publish(&model, &bytes));
+            if let Err(error) = published {
+                warn!(path = %path.display(), %error, "checkpoint not published");
+                if error.code == Code::Internal {
+                    // It could not be kept; the next time it may.
+                    continue;
+                }
+            }
+            seen.insert(model, stamp);
+        }
+        Ok(())
+    }
+
+    /// Makes a checkpoint the next version of a model and promotes it, unless it is the last one already.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for a faulty checkpoint or name, with the reason; `INTERNAL` if it cannot be written.
+    pub fn publish(&self, model: &str, bytes: &[u8]) -> Result<(), Error> {
+        let checkpoint = cpn::checkpoint::from_bytes(bytes)
+            .map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
+        let mut histories = self.histories();
+        let mut history = histories.get(model).cloned().unwrap_or_default();
+        let last = history.manifests().last();
+        if last.is_some_and(|last| last.digest == checkpoint.digest) {
+            return Ok(());
+        }
+        let manifest = history::valid(CheckpointManifest {
+            model: model.to_owned(),
+            version: last.map_or(1, |last| last.version + 1),
+            parents: checkpoint.parents(),
+            digest: checkpoint.digest,
+            size_bytes: bytes.len() as u64,
+            config_digest: checkpoint.config_digest,
+        })?;
+        let weights = history::weights(&self.folder(model), &manifest.digest);
+        files::write_atomically(&weights, bytes).map_err(|e| unwritten(&e))?;
+        history.add(manifest, self.keep);
+        self.commit(&mut histories, model, history).map(drop)
+    }
+
+    /// The versions of a model, or of all.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown model.
+    pub fn list(&self, request: ListVersionsRequest) -> Result<ListVersionsResponse, Error> {
+        let histories = self.histories();
+        let wanted: Vec<&History> = match request.model {
+            Some(model) => vec![find(&histories, &model)?],
+            None => histories.values().collect(),
+        };
+        let versions = wanted.into_iter().flat_map(|history| {
+            history.manifests().iter().map(|manifest| {
+                let promoted = history.promoted()?.version == manifest.version;
+                Ok(CheckpointVersion { manifest: manifest.clone(), promoted })
+            })
+        });
+        Ok(ListVersionsResponse { versions: versions.collect::<Result<_, Error>>()? })
+    }
+
+    /// Lets planners serve a version that is kept.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown model or version; `INTERNAL` if it cannot be written.
+    pub fn promote(&self, request: PromoteVersionRequest) -> Result<PromoteVersionResponse, Error> {
+        let PromoteVersionRequest { model, version } = request;
+        let mut histories = self.histories();
+        let mut history = find(&histories, &model)?.clone();
+        let kept: Vec<u32> = history.manifests().iter().map(|manifest| manifest.version).collect();
+        if !kept.contains(&version) {
+            return Err(Error::new(Code::NotFound, "version", format!("one of {kept:?}"), version));
+        }
+        history.promote(version);
+        Ok(PromoteVersionResponse { manifest: self.commit(&mut histories, &model, history)? })
+    }
+
+    /// Lets planners serve the version that was promoted before the one that is.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no other that is kept was promoted; `INTERNAL` if it
+    /// cannot be written.
+    pub fn roll_back(&self, RollBackRequest { model }: RollBackRequest) -> Result<RollBackResponse, Error> {
+        let mut histories = self.histories();
+        let mut history = find(&histories, &model)?.clone();
+        if !history.roll_back() {
+            let expected = "one of which another version that is kept was promoted before";
+            return Err(Error::new(Code::FailedPrecondition, "model", expected, model));
+        }
+        Ok(RollBackResponse { manifest: self.commit(&mut histories, &model, history)? })
+    }
+
+    /// A piece of a version that is kept.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for a digest that no version has; `INVALID_ARGUMENT` for an offset beyond its end; `INTERNAL` if it cannot
+    /// be read.
+    pub fn chunk(&self, request: CheckpointChunkRequest) -> Result<CheckpointChunkResponse, Error> {
+        let CheckpointChunkRequest { digest, offset_bytes, length_bytes } = request;
+        let histories = self.histories();
+        let mut manifests = histories.values().flat_map(History::manifests);
+        let CheckpointManifest { model, size_bytes, .. } = manifests
+            .find(|manifest| manifest.digest == digest)
+            .ok_or_else(|| Error::new(Code::NotFound, "digest", "that of a version that is kept", &digest))?;
+        if offset_bytes >= *size_bytes {
+            return Err(Error::invalid("offset_bytes", format!("less than {size_bytes}"), offset_bytes));
+        }
+        let mut data = vec![0; u64::from(length_bytes).min(size_bytes - offset_bytes) as usize];
+        File::open(history::weights(&self.folder(model), &digest))
+            .and_then(|file| file.read_exact_at(&mut data, offset_bytes))
+            .map_err(|e| Error::new(Code::Internal, "digest", "weights that can be read", e))?;
+        Ok(CheckpointChunkResponse { data })
+    }
+
+    /// Makes a change last, then lets it be known; answers what is promoted.
+    fn commit(
+        &self,
+        histories: &mut BTreeMap<String, History>,
+        model: &str,
+        history: History,
+    ) -> Result<CheckpointManifest, Error> {
+        let announcement = history.announcement()?;
+        history.write(&self.folder(model)).map_err(|e| unwritten(&e))?;
+        histories.insert(model.to_owned(), history);
+        let manifest = announcement.manifest.clone();
+        info!(model, version = manifest.version, digest = manifest.digest, "promoted");
+        self.promoted.send_modify(|promoted| drop(promoted.insert(model.to_owned(), announcement)));
+        Ok(manifest)
+    }
+
+    fn folder(&self, model: &str) -> PathBuf {
+        self.checkpoints.join(VERSIONS).join(model)
+    }
+
+    fn histories(&self) -> MutexGuard<'_, BTreeMap<String, History>> {
+        self.histories.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn find<'a>(histories: &'a BTreeMap<String, History>, model: &str) -> Result<&'a History, Error> {
+    histories.get(model).ok_or_else(|| {
+        let models: Vec<_> = histories.keys().map(String::as_str).collect();
+        Error::new(Code::NotFound, "model", format!("one of {}", models.join(", ")), model)
+    })
+}
+
+fn unwritten(error: &anyhow::Error) -> Error {
+    Error::new(Code::Internal, "checkpoint", "one that can be written", format!("{error:#}"))
+}

@@ -1,0 +1,138 @@
+//! What a run is fed: each sample once an epoch, the right goals, frames once a batch.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use common::{episode, keep, step};
+use cpn::recipe::GoalSampling;
+use cpn::{Input, ModelConfig, Preset, Recipe, Training};
+use std::collections::{BTreeMap, BTreeSet};
+use tch::Tensor;
+use trainer::dataset::Dataset;
+use trainer::sampler::{Sample, Sampler};
+
+/// Steps of the episodes, the last without an action.
+const STEPS: [u32; 3] = [9, 23, 14];
+
+fn dataset() -> Dataset {
+    let folder = tempfile::tempdir().unwrap();
+    for (seed, steps) in STEPS.into_iter().enumerate() {
+        keep(folder.path(), &episode("reach", seed as u64, steps));
+    }
+    Dataset::load(folder.path(), &[], Input::Image).unwrap()
+}
+
+fn recipe(change: impl FnOnce(&mut Training)) -> Recipe {
+    let mut recipe = Preset::PaperCpn.recipe();
+    change(&mut recipe.training);
+    recipe
+}
+
+fn floats(tensor: &Tensor) -> Vec<f32> {
+    Vec::try_from(tensor.flatten(0, -1)).unwrap()
+}
+
+#[test]
+fn every_moment_is_seen_once_an_epoch_and_the_order_is_the_seeds() {
+    let dataset = dataset();
+    for samples_per_draw in [1, 4, 100] {
+        let recipe = recipe(|training| training.samples_per_draw = samples_per_draw);
+        let sampler = Sampler::new(&dataset, &recipe, 7);
+        let (first, second) = (sampler.epoch(0), sampler.epoch(1));
+        let moments = |samples: &[Sample]| samples.iter().map(|s| (s.episode, s.step)).collect::<BTreeSet<_>>();
+        let all = (0..3).flat_map(|e| (0..STEPS[e as usize] - 1).map(move |s| (e, s))).collect::<BTreeSet<_>>();
+        assert_eq!((first.len(), moments(&first)), (all.len(), all.clone()));
+        assert_eq!(moments(&second), all);
+        assert_ne!(first, second);
+        assert_eq!(first, Sampler::new(&dataset, &recipe, 7).epoch(0));
+        assert_ne!(first, Sampler::new(&dataset, &recipe, 8).epoch(0));
+    }
+}
+
+#[test]
+fn goals_lie_where_the_recipe_says() {
+    let dataset = dataset();
+    let reach = |goals, action_block| {
+        let recipe = recipe(|training| (training.goals, training.action_block) = (goals, action_block));
+        let samples = Sampler::new(&dataset, &recipe, 7).epoch(0);
+        let last = |s: &Sample| STEPS[s.episode as usize] - 1;
+        assert!(samples.iter().all(|s| s.goal > s.step && s.goal <= last(s)));
+        let at_the_end = samples.iter().filter(|s| s.goal == last(s)).count();
+        (samples.iter().map(|s| s.goal - s.step).max().unwrap(), at_the_end, samples.len())
+    };
+    let (farthest, at_the_end, all) = reach(GoalSampling::Final, 1);
+    assert_eq!((farthest, at_the_end), (22, all));
+    assert_eq!(reach(GoalSampling::WithinHorizon, 1).0, 5);
+    assert_eq!(reach(GoalSampling::WithinHorizon, 2).0, 10);
+    let (farthest, at_the_end, all) = reach(GoalSampling::Hindsight, 1);
+    assert!(farthest > 10 && at_the_end < all / 2, "{farthest} {at_the_end}");
+}
+
+/// Frames, actions and mask of a batch against the recordings themselves.
+#[test]
+fn a_batch_is_what_was_recorded() {
+    let dataset = dataset();
+    let (horizon, size) = (ModelConfig::paper(cpn::MethodKind::Cpn).horizon as u32, 4);
+    for (goals, block) in [(GoalSampling::Final, 1), (GoalSampling::Hindsight, 1), (GoalSampling::Final, 3)] {
+        let recipe = recipe(|training| (training.goals, training.action_block) = (goals, block));
+        let sampler = Sampler::new(&dataset, &recipe, 3);
+        let samples = sampler.epoch(0);
+        let batch = sampler.batch(0, &samples);
+        let frames = batch.frames.size()[0];
+        let distinct: BTreeSet<_> = samples.iter().flat_map(|s| [(s.episode, s.step), (s.episode, s.goal)]).collect();
+        assert_eq!(frames, distinct.len() as i64, "each frame once");
+        let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
+        for (row, s) in samples.iter().enumerate() {
+            let recorded = |number| step("reach", s.episode.into(), STEPS[s.episode as usize], number);
+            for (index, number) in [(&batch.observations, s.step), (&batch.goals, s.goal)] {
+                let frame = batch.frames.get(index.int64_value(&[row as i64]));
+                let pixels: Vec<u8> = Vec::try_from(frame.flatten(0, -1)).unwrap();
+                assert_eq!(pixels, recorded(number).frame.data());
+            }
+            for t in 0..horizon {
+                let steps = (s.step + t * block as u32..s.step + (t + 1) * block as u32).filter(|n| *n < s.goal);
+                let recorded: Vec<_> = steps.map(|n| recorded(n).action.unwrap()).collect();
+                let at = row * horizon as usize + t as usize;
+                assert_eq!(mask[at], f32::from(!recorded.is_empty()));
+                for i in 0..size {
+                    let mean = recorded.iter().map(|action| action[i]).sum::<f32>() / recorded.len().max(1) as f32;
+                    assert!((actions[at * size + i] - mean).abs() < 1e-6);
+                }
+            }
+        }
+    }
+}
+
+/// Samples that are drawn together share their goal's frame.
+#[test]
+fn drawing_together_saves_frames() {
+    let dataset = dataset();
+    let frames = |samples_per_draw| {
+        let recipe = recipe(|training| training.samples_per_draw = samples_per_draw);
+        let sampler = Sampler::new(&dataset, &recipe, 3);
+        let by_episode = sampler.epoch(0)[..8].iter().fold(BTreeMap::new(), |mut counts, s| {
+            *counts.entry(s.episode).or_insert(0) += 1;
+            counts
+        });
+        (sampler.batch(0, &sampler.epoch(0)[..8]).frames.size()[0], by_episode.len())
+    };
+    let (frames, episodes) = frames(8);
+    assert_eq!((frames, episodes), (9, 1));
+}
+
+/// A run that begins in the middle of an epoch sees what it would have seen.
+#[test]
+fn batches_go_on_from_any_step() {
+    let dataset = dataset();
+    let recipe = recipe(|training| (training.batch_size, training.shift_pixels) = (8, 4));
+    let sampler = Sampler::new(&dataset, &recipe, 3);
+    let per_epoch = sampler.steps_per_epoch() as usize;
+    let all: Vec<_> = sampler.batches(0).take(3 * per_epoch).collect();
+    assert_eq!(all.iter().map(|b| b.observations.size()[0]).sum::<i64>(), 3 * dataset.sample_count() as i64);
+    for start in [1, per_epoch, per_epoch + 2] {
+        let later = sampler.batches(start as u64).next().unwrap();
+        assert_eq!((&later.frames, &later.actions), (&all[start].frames, &all[start].actions));
+    }
+    assert_ne!(all[0].frames.size(), [0]);
+}
