@@ -22,8 +22,8 @@ stop() {
 trap stop EXIT
 trap 'stop; exit 130' INT TERM
 
-target/release/cpn-trainer serve --dataset "$dataset" --checkpoints "$out/none" --listen "$endpoint" \
-  --namespace "$CPN_NAMESPACE" 2>"$out/recorder.log" &
+target/release/cpn-trainer serve --dataset "$dataset" --checkpoints "$out/none" --runs "$out/none" --grpc-listen 127.0.0.1:0 \
+  --listen "$endpoint" --namespace "$CPN_NAMESPACE" 2>"$out/recorder.log" &
 started+=($!)
 "$CPN_SIM_WORKER" demonstrate --tasks jenga-poke --episodes 21 --connect "$endpoint" --namespace "$CPN_NAMESPACE"
 target/release/cpn-trainer verify --dataset "$dataset" --episodes 21

@@ -56,7 +56,7 @@ def network(endpoint: str, *services: str) -> Iterator[zenoh.Session]:
 
 
 def request(session: zenoh.Session, key: str, message: Message, response_type: type[M]) -> M:
-    """The answer of the one service behind `key`. Plans, resets and steps may be asked for twice; a step is applied once.
+    """The answer of the one service behind `key`. Whatever is asked here may be asked again; a step is applied once.
 
     Raises:
         UnavailableError: If no try was answered in time.

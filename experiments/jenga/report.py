@@ -130,7 +130,7 @@ def draw(demonstrations: list[list[list[float]]], trials: Trials, path: Path) ->
 
 
 def main(folder: Path) -> None:
-    """Reads what choose.py and execute.py left in a folder; writes report.json, report.md and trajectories.png beside."""
+    """Reads what choose.py and execute.py left; writes report.json, report.md and trajectories.png beside."""
     demonstrations, grid = (json.loads((folder / f"{name}.json").read_text()) for name in ("demonstrations", "../grid"))
     # Two workers write as they come; the picture and the pairs want an order.
     lines = (folder / "trials.jsonl").read_text().splitlines()
