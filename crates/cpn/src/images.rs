@@ -26,15 +26,15 @@ pub fn from_bytes(data: &[u8]) -> Result<Tensor, ImageError> {
 pub fn blocks(images: &Tensor, size: usize) -> Tensor {
     let mut bytes = vec![0; images.numel()];
     images.copy_data_u8(&mut bytes, images.numel());
+    // 8 bits fit a bfloat16, which is the upper half of a float32.
+    let halves: Vec<u16> = bytes.iter().map(|value| (f32::from(*value).to_bits() >> 16) as u16).collect();
     let run = size * CHANNELS as usize;
-    let mut blocks = Vec::with_capacity(bytes.len());
+    let mut blocks = Vec::with_capacity(halves.len());
     // A band of `size` rows holds a row of blocks.
-    for band in bytes.chunks_exact(run * SIZE as usize) {
+    for band in halves.chunks_exact(run * SIZE as usize) {
         for block in 0..SIZE as usize / size {
             for row in band.chunks_exact((SIZE * CHANNELS) as usize) {
-                // The upper half of a float32 is the bfloat16, and 8 bits fit it.
-                let values = row[block * run..][..run].iter();
-                blocks.extend(values.map(|value| (f32::from(*value).to_bits() >> 16) as u16));
+                blocks.extend_from_slice(&row[block * run..][..run]);
             }
         }
     }

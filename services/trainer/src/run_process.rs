@@ -22,6 +22,9 @@ const GRACE: Duration = Duration::from_secs(30);
 const MAX_LINE_BYTES: usize = 4096;
 /// How the names of variables begin that would override a run's settings.
 const VARIABLES: &str = "CPN_TRAIN_";
+/// Tells glibc to keep the large blocks of a step for the next one; otherwise the kernel takes them and clears them anew.
+const KEEP_MEMORY: [(&str, &str); 2] =
+    [("MALLOC_MMAP_THRESHOLD_", "4000000000"), ("MALLOC_TRIM_THRESHOLD_", "4000000000")];
 
 /// How a process ended.
 #[derive(Debug)]
@@ -58,6 +61,7 @@ pub(crate) async fn run(
         for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with(VARIABLES)) {
             command.env_remove(name);
         }
+        command.envs(KEEP_MEMORY);
         command.arg("train").arg("--json").arg("--config").arg(settings);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).kill_on_drop(true);
         attend(command, stop, hear).await

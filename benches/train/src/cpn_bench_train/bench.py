@@ -31,7 +31,7 @@ PEERS = {
 }
 GROWTH = {
     "latent": (32, 64, 128),
-    "horizon": (1, 5, 10, 20),
+    "horizon": (1, 5, 10),
     "updates": (0, 1, 2, 4),
     "batch": (32, 128, 512),
 }

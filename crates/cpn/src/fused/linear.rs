@@ -1,7 +1,9 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
+use super::lanes::Lanes;
 use super::real::Real;
 use gemm::Parallelism;
+use pulp::{Arch, Simd, WithSimd};
 
 /// Weights by their names in a checkpoint.
 pub trait Weights<T> {
@@ -100,8 +102,24 @@ impl<T> LinearGradient<T> {
 
 /// `sum += x`, element by element.
 pub fn add<T: Real>(sum: &mut [T], x: &[T]) {
-    for (sum, x) in sum.iter_mut().zip(x) {
-        *sum += *x;
+    Arch::new().dispatch(Sum { sum, x });
+}
+
+#[derive(Debug)]
+struct Sum<'a, T> {
+    sum: &'a mut [T],
+    x: &'a [T],
+}
+
+impl<T: Real> WithSimd for Sum<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let count = Lanes::<S, T>::COUNT;
+        for (sum, x) in self.sum.chunks_mut(count).zip(self.x.chunks(count)) {
+            Lanes::load(simd, x).add_to(sum);
+        }
     }
 }
 
