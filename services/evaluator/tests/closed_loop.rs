@@ -255,7 +255,7 @@ async fn what_cannot_be_evaluated_is_named() {
     let _worker = lab.worker("w0", 5);
     let ended = lab.evaluate(&["--tasks", "reach", "--models", "cpn,upn", "--wait-secs", "120"]).await;
     assert!(!ended.success);
-    assert!(ended.stderr.contains("--models: planner \"planner\" serves cpn, random; got upn"));
+    assert!(ended.stderr.contains("--models: planner \"planner\" serves cpn, jenga, random; got upn"));
 
     let ended = lab.evaluate(&["--tasks", "reach-the-moon"]).await;
     assert!(!ended.success);

@@ -19,7 +19,7 @@ use wire::demonstration::RecordedEpisode;
 
 /// A little past where the hands end, as a block lies past the hand that pokes it.
 const GOAL: [f32; 3] = [0.71, 0.0, 0.2];
-const STARTS: [[f32; 3]; 4] = [[0.65, -0.03, 0.2], [0.62, 0.02, 0.22], [0.64, 0.0, 0.17], [0.66, 0.03, 0.19]];
+const STARTS: [[f32; 3]; 4] = [[0.65, -0.03, 0.2], [0.63, 0.02, 0.22], [0.64, 0.0, 0.17], [0.66, 0.03, 0.19]];
 const ACTIONS: u32 = 8;
 
 /// Where a hand is that goes straight, to 1 cm before the goal.

@@ -161,7 +161,8 @@ fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
     let base = config(folder.path(), "short");
     let loss_of = |path: &Path| {
-        let agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        let mut agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        agent.variables_mut().unfreeze();
         let dataset = Dataset::load(&base.dataset, &[], Input::Image).unwrap();
         let recipe = base.recipe();
         let sampler = Sampler::new(&dataset, &recipe, 0);
