@@ -61,7 +61,8 @@ pub(crate) async fn run(
         for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with(VARIABLES)) {
             command.env_remove(name);
         }
-        command.envs(KEEP_MEMORY);
+        // The end of its log is the reason if it fails: that of the error, not of a stack.
+        command.envs(KEEP_MEMORY).env("RUST_LIB_BACKTRACE", "0");
         command.arg("train").arg("--json").arg("--config").arg(settings);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).kill_on_drop(true);
         attend(command, stop, hear).await
