@@ -142,7 +142,7 @@ impl Dataset {
     }
 }
 
-fn header(path: &PathBuf) -> anyhow::Result<RecordedEpisode> {
+fn header(path: &Path) -> anyhow::Result<RecordedEpisode> {
     let info = recording::read_header(path).with_context(|| path.display().to_string())?;
     ensure!(info.steps >= 2, "{}: steps: expected at least 2, got {}", path.display(), info.steps);
     Ok(info)
