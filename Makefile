@@ -9,7 +9,7 @@ BENCH := benches/train/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -47,6 +47,9 @@ demo: build ## Show CPN, TE-BC and random three tasks each, and report who solve
 dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check them (EPISODES=n for fewer)
 	scripts/dataset.sh
 
+jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint errors, pokes, a picture of the trajectories
+	scripts/jenga.sh
+
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
 
@@ -79,12 +82,12 @@ bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JA
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../export && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../export
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export
 
 clean: ## Remove what was built
 	rm -rf target $(WORKER) $(EXPORT) $(BENCH) .libtorch

@@ -95,6 +95,12 @@ def test_jenga_is_served_by_the_same_worker(worker: Worker) -> None:
         worker.step(start.episode_id, 0)
     response = worker.step(start.episode_id, 0, (1, 0, 0))
     assert -1 < response.reward < 0
+    moved = np.subtract(response.hand_position, start.hand_position)
+    assert 0.002 < moved[0] < 0.01
+    assert np.abs(moved[1:]).max() < 0.002
+    from_goal = np.subtract(response.hand_position, start.goal_position)
+    assert response.reward == pytest.approx(-np.linalg.norm(from_goal), abs=1e-6)
+    assert not worker.reset().hand_position
     with pytest.raises(RequestError, match=r"INVALID_ARGUMENT variation.seed: expected at least 1000000, got 3"):
         worker.reset("jenga-poke-offset", 3)
     worker.reset()

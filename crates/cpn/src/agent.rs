@@ -1,6 +1,6 @@
 //! The compared methods behind one interface (section "Methods for comparison").
 
-use crate::config::ModelConfig;
+use crate::config::{Input, ModelConfig};
 use crate::dynamics::PolicyDynamics;
 use crate::encoder::Encoder;
 use crate::loss::{self, Batch};
@@ -18,6 +18,9 @@ pub trait Method: Send {
 
     /// Number of actions in a plan.
     fn horizon(&self) -> i64;
+
+    /// Whether observations and goals of this kind can be embedded.
+    fn takes(&self, input: Input) -> bool;
 
     /// Embeds observations or goals, images `[B, 84, 84, 3]` or positions `[B, 3]`, as `[B, Z]`; Z is 0 for a method that
     /// does not look.
@@ -117,6 +120,10 @@ impl Method for Agent {
         self.config.horizon
     }
 
+    fn takes(&self, input: Input) -> bool {
+        self.config.encoder.input() == input
+    }
+
     fn encode(&self, input: &Tensor) -> Tensor {
         tch::no_grad(|| self.encoder.encode(input))
     }
@@ -144,6 +151,10 @@ impl Method for Random {
 
     fn horizon(&self) -> i64 {
         1
+    }
+
+    fn takes(&self, _input: Input) -> bool {
+        true
     }
 
     fn encode(&self, input: &Tensor) -> Tensor {

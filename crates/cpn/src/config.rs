@@ -74,6 +74,15 @@ impl ConvConfig {
     }
 }
 
+/// What observations and goals are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Input {
+    /// Camera images, 84 x 84.
+    Image,
+    /// Positions in space.
+    Position,
+}
+
 /// The encoder f_φ, by what observations and goals are.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
@@ -123,10 +132,18 @@ impl EncoderConfig {
         })
     }
 
-    /// The paper's encoder for positions that lie about `centre_mm`, `scale_mm` from it or so.
+    /// Our encoder of positions that lie about `centre_mm`, `scale_mm` from it or so: the paper tells nothing of its own.
     pub fn position(centre_mm: [i64; 3], scale_mm: i64) -> Self {
         let layers = vec![64];
-        Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 64, layer_norm: true })
+        Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 16, layer_norm: true })
+    }
+
+    /// What it embeds.
+    pub fn input(&self) -> Input {
+        match self {
+            Self::Image(_) => Input::Image,
+            Self::Position(_) => Input::Position,
+        }
     }
 
     /// Z, the size of the embedding.

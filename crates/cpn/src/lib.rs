@@ -35,6 +35,6 @@ pub mod positions;
 pub mod recipe;
 
 pub use agent::{Agent, Method, Random};
-pub use config::{EncoderConfig, MethodKind, ModelConfig};
+pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
 pub use planner::Plan;
 pub use recipe::{Preset, Recipe, Training};

@@ -10,6 +10,7 @@ pub mod grpc;
 mod image;
 pub mod key;
 mod message;
+mod observation;
 pub mod planner;
 pub mod query;
 pub mod sim;
@@ -18,6 +19,7 @@ pub mod training;
 pub use error::{Code, Error};
 pub use image::Image;
 pub use message::{Message, decode, encode};
+pub use observation::{Observation, Position};
 
 /// The generated protobuf types.
 #[allow(missing_docs, clippy::all, reason = "generated code")]

@@ -1,7 +1,7 @@
 //! Requests to the planner service and its answers.
 
 use crate::message::{action, digest, name, required};
-use crate::{Error, Image, Message, proto};
+use crate::{Error, Image, Message, Observation, Position, proto};
 use std::time::Duration;
 
 /// Where to plan to.
@@ -11,6 +11,8 @@ pub enum Goal {
     Id(String),
     /// A picture of the finished task.
     Image(Image),
+    /// Where the hand is to go.
+    Position(Position),
 }
 
 /// Asks for the next actions towards a goal.
@@ -20,8 +22,8 @@ pub struct PlanRequest {
     pub model: String,
     /// Where to plan to.
     pub goal: Goal,
-    /// What the camera shows now.
-    pub observation: Image,
+    /// What the camera shows now, or where the hand is.
+    pub observation: Observation,
     /// Drives whatever is random in the model.
     pub seed: u64,
     /// How long after its arrival the answer is still of use, in whole milliseconds.
@@ -140,11 +142,22 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
             proto::plan_request::Goal::GoalImage(image) => {
                 Goal::Image(image.try_into().map_err(|e: Error| e.within("goal_image"))?)
             }
+            proto::plan_request::Goal::GoalPosition(position) => {
+                Goal::Position(position.try_into().map_err(|e: Error| e.within("goal_position"))?)
+            }
+        };
+        let observation = match request.observed.ok_or_else(|| Error::missing("observation"))? {
+            proto::plan_request::Observed::Observation(image) => {
+                Observation::Image(image.try_into().map_err(|e: Error| e.within("observation"))?)
+            }
+            proto::plan_request::Observed::Position(position) => {
+                Observation::Position(position.try_into().map_err(|e: Error| e.within("position"))?)
+            }
         };
         Ok(Self {
             model: name("model", request.model)?,
             goal,
-            observation: required("observation", request.observation)?,
+            observation,
             seed: request.seed,
             deadline: (request.deadline_ms > 0).then(|| Duration::from_millis(request.deadline_ms.into())),
             model_digest: (!request.model_digest.is_empty())
@@ -161,8 +174,12 @@ impl From<PlanRequest> for proto::PlanRequest {
             goal: Some(match request.goal {
                 Goal::Id(id) => proto::plan_request::Goal::GoalId(id),
                 Goal::Image(image) => proto::plan_request::Goal::GoalImage(image.into()),
+                Goal::Position(position) => proto::plan_request::Goal::GoalPosition(position.into()),
             }),
-            observation: Some(request.observation.into()),
+            observed: Some(match request.observation {
+                Observation::Image(image) => proto::plan_request::Observed::Observation(image.into()),
+                Observation::Position(position) => proto::plan_request::Observed::Position(position.into()),
+            }),
             seed: request.seed,
             deadline_ms: request.deadline.map_or(0, |d| u32::try_from(d.as_millis()).unwrap_or(u32::MAX)),
             model_digest: request.model_digest.unwrap_or_default(),

@@ -1,7 +1,7 @@
 //! Requests to a simulator worker and its answers.
 
-use crate::message::{action, position, required};
-use crate::{Error, Image, Message, proto};
+use crate::message::{action, required};
+use crate::{Error, Image, Message, Position, proto};
 
 /// The randomised object positions of an episode.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -32,8 +32,10 @@ pub struct ResetResponse {
     pub observation: Image,
     /// The episode ends after this many steps at the latest.
     pub max_steps: u32,
-    /// Where the goal is: x, y, z in metres; empty if it is no position.
-    pub goal_position: Vec<f32>,
+    /// Where the goal is, if it is a position.
+    pub goal_position: Option<Position>,
+    /// Where the hand is, if the goal is a position.
+    pub hand_position: Option<Position>,
 }
 
 /// Applies one action, exactly once.
@@ -58,6 +60,8 @@ pub struct StepResponse {
     pub success: bool,
     /// Whether the episode is over.
     pub done: bool,
+    /// Where the hand is after the action, if the goal is a position.
+    pub hand_position: Option<Position>,
 }
 
 impl TryFrom<proto::Variation> for Variation {
@@ -105,7 +109,8 @@ impl TryFrom<proto::ResetResponse> for ResetResponse {
             goal: required("goal", response.goal)?,
             observation: required("observation", response.observation)?,
             max_steps: response.max_steps,
-            goal_position: position("goal_position", response.goal_position)?,
+            goal_position: position("goal_position", &response.goal_position)?,
+            hand_position: position("hand_position", &response.hand_position)?,
         })
     }
 }
@@ -117,7 +122,8 @@ impl From<ResetResponse> for proto::ResetResponse {
             goal: Some(response.goal.into()),
             observation: Some(response.observation.into()),
             max_steps: response.max_steps,
-            goal_position: response.goal_position,
+            goal_position: metres(response.goal_position),
+            hand_position: metres(response.hand_position),
         }
     }
 }
@@ -162,13 +168,27 @@ impl TryFrom<proto::StepResponse> for StepResponse {
             reward: response.reward,
             success: response.success,
             done: response.done,
+            hand_position: position("hand_position", &response.hand_position)?,
         })
     }
 }
 
 impl From<StepResponse> for proto::StepResponse {
     fn from(response: StepResponse) -> Self {
-        let StepResponse { observation, reward, success, done } = response;
-        Self { observation: Some(observation.into()), reward, success, done }
+        let StepResponse { observation, reward, success, done, hand_position } = response;
+        Self { observation: Some(observation.into()), reward, success, done, hand_position: metres(hand_position) }
     }
+}
+
+/// A position, or none for no values.
+fn position(field: &str, values: &[f32]) -> Result<Option<Position>, Error> {
+    match *values {
+        [] => Ok(None),
+        [x, y, z] => Position::new([x, y, z]).map(Some).map_err(|e| e.within(field)),
+        _ => Err(Error::invalid(field, "0 or 3 values", values.len())),
+    }
+}
+
+fn metres(position: Option<Position>) -> Vec<f32> {
+    position.map(Position::metres).into_iter().flatten().collect()
 }

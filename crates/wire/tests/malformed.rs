@@ -6,7 +6,8 @@ use prost::Message as _;
 use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
-use wire::sim::StepRequest;
+use wire::proto::plan_request::{Goal, Observed};
+use wire::sim::{StepRequest, StepResponse};
 use wire::training::{Run, StartRunRequest};
 use wire::{Code, Error, decode, proto};
 
@@ -18,8 +19,8 @@ fn black(side: u32) -> proto::Image {
 fn plan_request() -> proto::PlanRequest {
     proto::PlanRequest {
         model: "cpn".into(),
-        goal: Some(proto::plan_request::Goal::GoalImage(black(84))),
-        observation: Some(black(84)),
+        goal: Some(Goal::GoalImage(black(84))),
+        observed: Some(Observed::Observation(black(84))),
         ..Default::default()
     }
 }
@@ -31,6 +32,13 @@ fn refusal(spoil: impl FnOnce(&mut proto::PlanRequest)) -> Error {
     decode::<PlanRequest>(&request.encode_to_vec()).unwrap_err()
 }
 
+fn image_of(request: &mut proto::PlanRequest) -> &mut proto::Image {
+    match &mut request.observed {
+        Some(Observed::Observation(image)) => image,
+        other => panic!("expected an image, got {other:?}"),
+    }
+}
+
 #[test]
 fn the_unspoiled_request_is_fine() {
     decode::<PlanRequest>(&plan_request().encode_to_vec()).unwrap();
@@ -38,11 +46,11 @@ fn the_unspoiled_request_is_fine() {
 
 #[test]
 fn each_wrong_field_is_named() {
-    let cases: [(Error, &str, &str, &str); 10] = [
+    let cases: [(Error, &str, &str, &str); 12] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
-            refusal(|r| r.goal = Some(proto::plan_request::Goal::GoalId("zz".into()))),
+            refusal(|r| r.goal = Some(Goal::GoalId("zz".into()))),
             "goal_id",
             "64 lower-case hexadecimal digits",
             "\"zz\"",
@@ -53,21 +61,28 @@ fn each_wrong_field_is_named() {
             "64 lower-case hexadecimal digits",
             &format!("{:?}", "5F".repeat(32)),
         ),
-        (refusal(|r| r.observation = None), "observation", "a value", "none"),
+        (refusal(|r| r.observed = None), "observation", "a value", "none"),
+        (refusal(|r| image_of(r).format = 0), "observation.format", "PIXEL_FORMAT_RGB8", "PIXEL_FORMAT_UNSPECIFIED"),
+        (refusal(|r| image_of(r).format = 77), "observation.format", "PIXEL_FORMAT_RGB8", "77"),
+        (refusal(|r| image_of(r).data.truncate(9)), "observation.data", "21168 bytes", "9 bytes"),
+        (refusal(|r| image_of(r).width = 0), "observation.width", "1 to 512 pixels", "0"),
         (
-            refusal(|r| r.observation.as_mut().unwrap().format = 0),
-            "observation.format",
-            "PIXEL_FORMAT_RGB8",
-            "PIXEL_FORMAT_UNSPECIFIED",
-        ),
-        (refusal(|r| r.observation.as_mut().unwrap().format = 77), "observation.format", "PIXEL_FORMAT_RGB8", "77"),
-        (refusal(|r| r.observation.as_mut().unwrap().data.truncate(9)), "observation.data", "21168 bytes", "9 bytes"),
-        (refusal(|r| r.observation.as_mut().unwrap().width = 0), "observation.width", "1 to 512 pixels", "0"),
-        (
-            refusal(|r| r.observation.as_mut().unwrap().render_spec = "x".repeat(1025)),
+            refusal(|r| image_of(r).render_spec = "x".repeat(1025)),
             "observation.render_spec",
             "at most 1024 bytes",
             "1025 bytes",
+        ),
+        (
+            refusal(|r| r.observed = Some(Observed::Position(proto::Position { y: f32::NAN, ..Default::default() }))),
+            "position.y",
+            "-1000 to 1000 metres",
+            "NaN",
+        ),
+        (
+            refusal(|r| r.goal = Some(Goal::GoalPosition(proto::Position { z: 1e4, ..Default::default() }))),
+            "goal_position.z",
+            "-1000 to 1000 metres",
+            "10000",
         ),
     ];
     for (error, field, expected, got) in cases {
@@ -97,6 +112,14 @@ fn an_action_that_is_not_a_number_is_refused() {
         proto::StepRequest { action: Some(proto::Action { values: vec![0.0, f32::NAN] }), ..Default::default() };
     let error = decode::<StepRequest>(&request.encode_to_vec()).unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("action.values", "NaN"));
+}
+
+#[test]
+fn a_position_of_two_values_is_refused() {
+    let observation = Some(black(84));
+    let response = proto::StepResponse { observation, hand_position: vec![0.0; 2], ..Default::default() };
+    let error = decode::<StepResponse>(&response.encode_to_vec()).unwrap_err();
+    assert_eq!((error.field.as_str(), error.got.as_str()), ("hand_position", "2"));
 }
 
 #[test]

@@ -11,7 +11,7 @@ use wire::demonstration::*;
 use wire::planner::*;
 use wire::sim::*;
 use wire::training::*;
-use wire::{Image, Message, decode, encode};
+use wire::{Image, Message, Position, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
     (1u32..6, 1u32..6, "\\PC{0,20}").prop_flat_map(|(height, width, spec)| {
@@ -34,6 +34,10 @@ fn action() -> impl Strategy<Value = Vec<f32>> {
 
 fn position() -> impl Strategy<Value = Vec<f32>> {
     prop_oneof![Just(Vec::new()), vec(-1.0f32..1.0, 3)]
+}
+
+fn point() -> impl Strategy<Value = Position> {
+    proptest::array::uniform3(-1000.0f32..=1000.0).prop_map(|metres| Position::new(metres).unwrap())
 }
 
 fn recorded() -> impl Strategy<Value = RecordedEpisode> {
@@ -110,8 +114,12 @@ proptest! {
     #[test]
     fn plan_request(
         model in name(),
-        goal in prop_oneof![digest().prop_map(Goal::Id), image().prop_map(Goal::Image)],
-        observation in image(),
+        goal in prop_oneof![
+            digest().prop_map(Goal::Id),
+            image().prop_map(Goal::Image),
+            point().prop_map(Goal::Position),
+        ],
+        observation in prop_oneof![image().prop_map(Into::into), point().prop_map(Into::into)],
         seed in any::<u64>(),
         deadline in option::of((1u64..u64::from(u32::MAX)).prop_map(Duration::from_millis)),
         model_digest in option::of(digest()),
@@ -162,12 +170,12 @@ proptest! {
         action in action(),
         reward in -9.0..9.0,
         (success, done) in any::<(bool, bool)>(),
-        goal_position in position(),
+        (goal_position, hand_position) in (option::of(point()), option::of(point())),
     ) {
         survives(ResetRequest { variation, goal_seed: success.then_some(u64::from(step)) });
         survives(StepRequest { episode_id: episode_id.clone(), step, action });
-        survives(StepResponse { observation: observation.clone(), reward, success, done });
-        survives(ResetResponse { episode_id, goal, observation, max_steps: step, goal_position });
+        survives(StepResponse { observation: observation.clone(), reward, success, done, hand_position });
+        survives(ResetResponse { episode_id, goal, observation, max_steps: step, goal_position, hand_position });
     }
 
     #[test]

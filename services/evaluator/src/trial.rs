@@ -4,7 +4,7 @@ use crate::record::{self, GoalSource, Model, Outcome, StageTimes};
 use std::time::Duration;
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
-use wire::{Code, Error, Image, Message, key, query};
+use wire::{Code, Error, Image, Message, Observation, key, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
@@ -55,7 +55,8 @@ impl From<Error> for Fault {
     }
 }
 
-/// Runs one episode: plans anew at each step and applies the first action (model predictive control).
+/// Runs one episode: plans anew at each step and applies the first action (model predictive control). Where the goal is a
+/// position, the model is told that and where the hand is, and no picture.
 pub(crate) async fn attempt(
     link: &Link,
     worker: &str,
@@ -64,34 +65,39 @@ pub(crate) async fn attempt(
     goal: GoalSource,
 ) -> Result<Attempt, Fault> {
     let reset = link.reset(worker, variation, goal).await?;
-    let mut goal_id = link.register_goal(&reset.goal).await?;
+    let mut goal = match reset.goal_position {
+        Some(position) => Goal::Position(position),
+        None => Goal::Id(link.register_goal(&reset.goal).await?),
+    };
     let step_key = key::sim_step(worker)?;
     let mut log = Log::default();
+    let mut hand = reset.hand_position;
     let mut frames = vec![reset.observation];
     for step in 0..reset.max_steps {
-        let request = |goal_id: &str| PlanRequest {
+        let request = |goal: &Goal| PlanRequest {
             model: model.name.clone(),
-            goal: Goal::Id(goal_id.to_owned()),
-            observation: frames[frames.len() - 1].clone(),
+            goal: goal.clone(),
+            observation: hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
             // The one that the run began with, though the planner may swap.
             model_digest: Some(model.digest.clone()),
         };
-        let mut plan = link.plan(request(&goal_id)).await;
+        let mut plan = link.plan(request(&goal)).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
             // The planner was restarted, or has evicted the goal.
-            goal_id = link.register_goal(&reset.goal).await?;
-            plan = link.plan(request(&goal_id)).await;
+            goal = Goal::Id(link.register_goal(&reset.goal).await?);
+            plan = link.plan(request(&goal)).await;
         }
         let plan = plan?;
         log.add(&plan);
         let request = StepRequest { episode_id: reset.episode_id.clone(), step, action: plan.first_action };
         let response: StepResponse = link.call(step_key.clone(), request).await?;
+        hand = response.hand_position;
         frames.push(response.observation);
         if response.done {
             let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
-            return Ok(Attempt { outcome, episode: log.finish(goal_id), goal: reset.goal, frames });
+            return Ok(Attempt { outcome, episode: log.finish(plan.goal_id), goal: reset.goal, frames });
         }
     }
     let expected = format!("true after {} steps", reset.max_steps);
@@ -210,7 +216,8 @@ mod tests {
                     goal: image(255),
                     observation: image(0),
                     max_steps: 5,
-                    goal_position: Vec::new(),
+                    goal_position: None,
+                    hand_position: None,
                 }),
             };
             query::reply(query, result).unwrap();
@@ -220,7 +227,8 @@ mod tests {
             let step = query::request::<StepRequest>(query).unwrap().step;
             let solved = step == 2;
             let observation = image(step as u8 + 1);
-            query::reply(query, Ok(StepResponse { observation, reward: 0.0, success: solved, done: solved })).unwrap();
+            let (reward, success, done, hand_position) = (0.0, solved, solved, None);
+            query::reply(query, Ok(StepResponse { observation, reward, success, done, hand_position })).unwrap();
         })
         .await;
         let registered = Arc::new(AtomicUsize::new(0));

@@ -6,7 +6,7 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, MethodKind, ModelConfig};
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
 use planner::Planner;
 use service_kit::SessionConfig;
 use std::net::TcpListener;
@@ -41,10 +41,15 @@ impl Lab {
             seed: 0,
             training: cpn::Training::paper(),
         };
-        let agent = Agent::new(ModelConfig::paper(MethodKind::Cpn), 0);
         let models_dir = folder.path().join("models");
         std::fs::create_dir(&models_dir).unwrap();
-        std::fs::write(models_dir.join("cpn.safetensors"), checkpoint::to_bytes(&agent, &provenance).unwrap()).unwrap();
+        let paper = ModelConfig::paper(MethodKind::Cpn);
+        let of_positions =
+            ModelConfig { encoder: EncoderConfig::position([600, 0, 200], 70), actions: 3, ..paper.clone() };
+        for (name, config) in [("cpn", paper), ("jenga", of_positions)] {
+            let bytes = checkpoint::to_bytes(&Agent::new(config, 0), &provenance).unwrap();
+            std::fs::write(models_dir.join(name).with_extension("safetensors"), bytes).unwrap();
+        }
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session =
@@ -125,6 +130,24 @@ fn files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     }
     files.sort();
     files
+}
+
+/// A task whose goal is a position is asked by position; a model of pictures does not take it.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_model_of_positions_is_told_positions() {
+    let mut lab = Lab::start().await;
+    let _worker = lab.worker("w0", 3);
+    let arguments = ["--workers", "1", "--tasks", "jenga-poke-offset", "--trials", "1", "--wait-secs", "120"];
+    let ended = lab.evaluate(&[&arguments[..], &["--models", "jenga"]].concat()).await;
+    assert!(ended.success);
+    let record = record(&lab.out(), "jenga-poke-offset/jenga/1000000.json");
+    assert_eq!(record["outcome"], "failure");
+    assert_eq!(record["episode"]["steps"], 3);
+    assert_eq!(record["episode"]["latent_distances"].as_array().unwrap().len(), 3);
+    let refused = lab.evaluate(&[&arguments[..], &["--models", "cpn"]].concat()).await;
+    assert!(!refused.success);
+    assert!(refused.stderr.contains("goal_position"), "{}", refused.stderr);
+    lab.stop_planner().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -232,7 +255,7 @@ async fn what_cannot_be_evaluated_is_named() {
     let _worker = lab.worker("w0", 5);
     let ended = lab.evaluate(&["--tasks", "reach", "--models", "cpn,upn", "--wait-secs", "120"]).await;
     assert!(!ended.success);
-    assert!(ended.stderr.contains("--models: planner \"planner\" serves cpn, random; got upn"));
+    assert!(ended.stderr.contains("--models: planner \"planner\" serves cpn, jenga, random; got upn"));
 
     let ended = lab.evaluate(&["--tasks", "reach-the-moon"]).await;
     assert!(!ended.success);

@@ -21,8 +21,8 @@ async fn main() -> anyhow::Result<()> {
     let endpoint = arguments.next().unwrap_or_else(|| "tcp/127.0.0.1:7447".into());
 
     let session = service_kit::session::open(&SessionConfig { connect: vec![endpoint], ..Default::default() }).await?;
-    let goal = Goal::Image(goal);
-    let request = PlanRequest { model: "cpn".into(), goal, observation, seed: 0, deadline: None, model_digest: None };
+    let (model, goal, observation) = ("cpn".into(), Goal::Image(goal), observation.into());
+    let request = PlanRequest { model, goal, observation, seed: 0, deadline: None, model_digest: None };
     let key = key::planner_plan("planner")?;
     let plan: PlanResponse = query::call(&session, &key, request, Duration::from_secs(10)).await?;
     println!("apply {:?} of {} planned actions", plan.first_action, plan.actions.len());

@@ -15,7 +15,7 @@ use wire::planner::{
     CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
     PlanResponse, RegisterGoalRequest, RegisterGoalResponse,
 };
-use wire::{Code, Error, Image};
+use wire::{Code, Error, Image, Observation};
 
 /// Checkpoints that are read at the same time at most: each may take as much memory as the largest model.
 const MAX_LOADS: usize = 4;
@@ -50,29 +50,33 @@ impl PlannerCore {
         })
     }
 
-    /// The next actions towards the goal, by the named model. A goal image is registered on the way.
+    /// The next actions towards the goal, by the named model. A goal that is not an id is registered on the way.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for an image that is not 84 x 84; `NOT_FOUND` for an unknown model or goal id;
+    /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse; `NOT_FOUND`
+    /// for an unknown model or goal id;
     /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently, or the checkpoint
     /// that must answer is not kept;
     /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
         let PlanRequest { model, goal, observation, seed, deadline, model_digest } = request;
-        check_size("observation", &observation)?;
+        if let Observation::Image(image) = &observation {
+            check_size("observation", image)?;
+        }
         if !self.thread.models().contains_key(&model) {
             return Err(unknown_model(&model, self.thread.models().keys()));
         }
         let (goal_field, (goal_id, goal)) = match goal {
             Goal::Id(id) => {
-                let image = self.goals.get(&id)?;
-                ("goal_id", (id, image))
+                let goal = self.goals.get(&id)?;
+                ("goal_id", (id, goal))
             }
             Goal::Image(image) => {
                 check_size("goal_image", &image)?;
-                ("goal_image.render_spec", self.goals.register(image))
+                ("goal_image", self.goals.register(image.into()))
             }
+            Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
         let task = PlanTask { model, model_digest, goal_id, goal, goal_field, observation, seed, deadline };
         self.thread.plan(task).await
@@ -84,7 +88,7 @@ impl PlannerCore {
     /// `INVALID_ARGUMENT` for an image that is not 84 x 84.
     pub fn register_goal(&self, request: RegisterGoalRequest) -> Result<RegisterGoalResponse, Error> {
         check_size("image", &request.image)?;
-        let (goal_id, _) = self.goals.register(request.image);
+        let (goal_id, _) = self.goals.register(request.image.into());
         Ok(RegisterGoalResponse { goal_id })
     }
 

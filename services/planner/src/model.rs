@@ -1,7 +1,7 @@
 //! A model as it is served, and what is checked before it is.
 
 use cpn::checkpoint::{self, Checkpoint, Provenance};
-use cpn::{Method, Random};
+use cpn::{Input, Method, Random, images, positions};
 use service_kit::files;
 use std::fmt;
 use std::io;
@@ -9,7 +9,7 @@ use std::path::Path;
 use tch::{Kind, Tensor};
 use wire::checkpoint::CheckpointManifest;
 use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo};
-use wire::{Code, Error, Image};
+use wire::{Code, Error, Observation};
 
 /// Name of the control of every comparison, always served.
 pub const RANDOM: &str = "random";
@@ -92,20 +92,43 @@ impl Model {
         Ok(model)
     }
 
-    /// Plans once, from black to white: the first request does not pay for it, and weights that are finite but lead to
-    /// plans that are not are found out.
+    /// Plans once, from black to white or from one corner of space to another: the first request does not pay for it, and
+    /// weights that are finite but lead to plans that are not are found out.
     fn warm_up(&self) -> Result<(), Error> {
-        let [x, x_g] = [0, u8::MAX].map(|level| self.encode_bytes(&vec![level; cpn::images::BYTES]));
+        let [x, x_g] = if self.method.takes(Input::Image) {
+            [0, u8::MAX].map(|level| self.encode_bytes(&vec![level; images::BYTES]))
+        } else {
+            [-1.0, 1.0].map(|metres| self.encode_metres([metres; 3]))
+        };
         self.plan(&x, &x_g, 0).map(drop).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))
     }
 
-    /// The embedding `[1, Z]` of an image of 84 x 84.
-    pub(crate) fn encode(&self, image: &Image) -> Tensor {
-        self.encode_bytes(image.data())
+    /// Checks that observations like this one, which came as `field`, are what the model takes.
+    ///
+    /// # Errors
+    /// If they are not.
+    pub(crate) fn check_takes(&self, field: &str, observation: &Observation) -> Result<(), Error> {
+        let (input, expected, got) = match observation {
+            Observation::Image(_) => (Input::Image, "a position", "an image"),
+            Observation::Position(_) => (Input::Position, "an image", "a position"),
+        };
+        if self.method.takes(input) { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
+    }
+
+    /// The embedding `[1, Z]` of an image of 84 x 84 or of a position.
+    pub(crate) fn encode(&self, observation: &Observation) -> Tensor {
+        match observation {
+            Observation::Image(image) => self.encode_bytes(image.data()),
+            Observation::Position(position) => self.encode_metres(position.metres()),
+        }
     }
 
     fn encode_bytes(&self, image: &[u8]) -> Tensor {
-        self.method.encode(&cpn::images::from_bytes(image).expect("images are checked as they arrive"))
+        self.method.encode(&images::from_bytes(image).expect("images are checked as they arrive"))
+    }
+
+    fn encode_metres(&self, position: [f32; 3]) -> Tensor {
+        self.method.encode(&positions::from_metres(&[position]))
     }
 
     /// Plans from x to x_g, both `[1, Z]`.

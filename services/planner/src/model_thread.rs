@@ -14,7 +14,7 @@ use tch::Tensor;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use tracing::error;
 use wire::planner::{ModelInfo, PlanResponse, StageTimes};
-use wire::{Code, Error, Image};
+use wire::{Code, Error, Observation};
 
 /// A request to plan whose names are resolved and whose images are of the right size.
 #[derive(Debug)]
@@ -23,12 +23,22 @@ pub(crate) struct PlanTask {
     /// The checkpoint that must answer.
     pub(crate) model_digest: Option<String>,
     pub(crate) goal_id: String,
-    pub(crate) goal: Arc<Image>,
-    /// The request's field that the goal's render spec came from.
+    pub(crate) goal: Arc<Observation>,
+    /// The request's field that the goal came from.
     pub(crate) goal_field: &'static str,
-    pub(crate) observation: Image,
+    pub(crate) observation: Observation,
     pub(crate) seed: u64,
     pub(crate) deadline: Option<Duration>,
+}
+
+impl PlanTask {
+    /// The request's field that the observation came from.
+    fn observation_field(&self) -> &'static str {
+        match self.observation {
+            Observation::Image(_) => "observation",
+            Observation::Position(_) => "position",
+        }
+    }
 }
 
 /// The caller's side of the thread.
@@ -185,6 +195,8 @@ impl Owner {
 
     fn plan(&mut self, task: &PlanTask) -> Result<PlanResponse, Error> {
         let model = self.models.get(&task.model, task.model_digest.as_deref())?;
+        model.check_takes(task.goal_field, &task.goal)?;
+        model.check_takes(task.observation_field(), &task.observation)?;
         check_render_specs(task, &model.render_spec)?;
         let started = Instant::now();
         // One by one: in a batch an embedding could differ, in its last bits, with what else is in the batch.
@@ -215,7 +227,8 @@ impl Owner {
 fn check_render_specs(task: &PlanTask, model: &str) -> Result<(), Error> {
     let (observation, goal) = (task.observation.render_spec(), task.goal.render_spec());
     let expected = [model, goal].into_iter().find(|spec| !spec.is_empty()).unwrap_or(observation);
-    for (field, got) in [(task.goal_field, goal), ("observation.render_spec", observation)] {
+    let goal_field = if task.goal_field == "goal_image" { "goal_image.render_spec" } else { task.goal_field };
+    for (field, got) in [(goal_field, goal), ("observation.render_spec", observation)] {
         if !got.is_empty() && got != expected {
             return Err(Error::new(Code::FailedPrecondition, field, expected, got));
         }

@@ -4,11 +4,14 @@
 
 mod common;
 
-use common::{Client, Fixture, checkpoint, checkpoint_for, from_bytes, from_file, image, plan_request, timeless};
+use common::{
+    Client, Fixture, checkpoint, checkpoint_for, from_bytes, from_file, image, plan_request, position_checkpoint,
+    position_request, timeless,
+};
 use cpn::MethodKind;
 use planner::model::RANDOM;
 use wire::planner::{ModelInfo, PlanResponse};
-use wire::proto::plan_request::Goal;
+use wire::proto::plan_request::{Goal, Observed};
 use wire::{Code, Error, proto};
 
 const MODELS: [&str; 5] = ["bc", "cpn", RANDOM, "te-bc", "upn"];
@@ -86,20 +89,23 @@ async fn every_transport_refuses_alike() {
     let fixture = start().await;
     let unregistered = "0".repeat(64);
     let cases = [
-        (spoiled(|r| r.observation = Some(smaller(83))), Error::invalid("observation.height", 84, 83)),
+        (
+            spoiled(|r| r.observed = Some(Observed::Observation(smaller(83)))),
+            Error::invalid("observation.height", 84, 83),
+        ),
         (
             spoiled(|r| r.goal = Some(Goal::GoalImage(proto::Image { width: 42, height: 168, ..image(0) }))),
             Error::invalid("goal_image.height", 84, 168),
         ),
         (
-            spoiled(|r| r.observation = Some(proto::Image { data: vec![0; 10], ..image(0) })),
+            spoiled(|r| r.observed = Some(Observed::Observation(proto::Image { data: vec![0; 10], ..image(0) }))),
             Error::invalid("observation.data", "21168 bytes", "10 bytes"),
         ),
         (
-            spoiled(|r| r.observation = Some(proto::Image { format: 0, ..image(0) })),
+            spoiled(|r| r.observed = Some(Observed::Observation(proto::Image { format: 0, ..image(0) }))),
             Error::invalid("observation.format", "PIXEL_FORMAT_RGB8", "PIXEL_FORMAT_UNSPECIFIED"),
         ),
-        (spoiled(|r| r.observation = None), Error::invalid("observation", "a value", "none")),
+        (spoiled(|r| r.observed = None), Error::invalid("observation", "a value", "none")),
         (spoiled(|r| r.goal = None), Error::invalid("goal", "a value", "none")),
         (
             spoiled(|r| r.model = "gpt".into()),
@@ -143,7 +149,7 @@ async fn every_transport_keeps_looks_apart() {
     let look = |spec: &str, seed| proto::Image { render_spec: spec.into(), ..image(seed) };
     let request = |model: &str, goal: &str, observation: &str| proto::PlanRequest {
         goal: Some(Goal::GoalImage(look(goal, 0))),
-        observation: Some(look(observation, 3)),
+        observed: Some(Observed::Observation(look(observation, 3))),
         ..plan_request(model, 3)
     };
     let (observation, goal_image) = ("observation.render_spec", "goal_image.render_spec");
@@ -203,4 +209,51 @@ async fn the_oldest_goal_goes_first() {
     for id in &ids[1..] {
         assert_eq!(client.plan(towards(id)).await.unwrap().goal_id, *id);
     }
+}
+
+/// Positions go the same ways as pictures, and neither passes for the other.
+#[tokio::test(flavor = "multi_thread")]
+async fn every_transport_plans_between_positions() {
+    let checkpoints = [("cpn", checkpoint(MethodKind::Cpn, 1)), ("jenga", position_checkpoint(1))];
+    let fixture = Fixture::start(&checkpoints, |_| ()).await;
+    let request = position_request("jenga");
+    let expected = timeless(fixture.clients()[0].plan(request.clone()).await.unwrap());
+    assert_eq!((expected.actions.len(), expected.first_action.len(), expected.inner_losses.len()), (5, 3, 2));
+    let of_position = request.observed.clone();
+    let spoiled = |spoil: &dyn Fn(&mut proto::PlanRequest)| {
+        let mut request = request.clone();
+        spoil(&mut request);
+        request
+    };
+    let (black, picture) = (Goal::GoalImage(image(0)), Some(Observed::Observation(image(1))));
+    let nowhere = proto::Position { x: f32::NAN, ..Default::default() };
+    let cases = [
+        (spoiled(&|r| r.goal = Some(black.clone())), Error::invalid("goal_image", "a position", "an image")),
+        (spoiled(&|r| r.observed = picture.clone()), Error::invalid("observation", "a position", "an image")),
+        (position_request("cpn"), Error::invalid("goal_position", "an image", "a position")),
+        (
+            proto::PlanRequest { observed: of_position.clone(), ..plan_request("cpn", 3) },
+            Error::invalid("position", "an image", "a position"),
+        ),
+        (
+            spoiled(&|r| r.observed = Some(Observed::Position(nowhere))),
+            Error::invalid("position.x", "-1000 to 1000 metres", "NaN"),
+        ),
+    ];
+    for client in fixture.clients() {
+        let transport = client.transport();
+        let plan = client.plan(request.clone()).await.unwrap();
+        assert_eq!(timeless(plan.clone()), expected, "{transport}");
+        let by_id = spoiled(&|r| r.goal = Some(Goal::GoalId(plan.goal_id.clone())));
+        assert_eq!(timeless(client.plan(by_id).await.unwrap()), expected, "{transport}: a goal's id stands for it");
+        let other = Goal::GoalPosition(proto::Position { x: 0.73, y: 0.09, z: 0.42 });
+        let other = client.plan(spoiled(&|r| r.goal = Some(other.clone()))).await.unwrap();
+        assert_ne!(other.actions, expected.actions, "{transport}: the goal counts");
+        for (request, error) in &cases {
+            assert_eq!(client.plan(request.clone()).await.unwrap_err(), *error, "{transport}");
+        }
+        // The control takes whatever comes.
+        client.plan(position_request(RANDOM)).await.unwrap();
+    }
+    fixture.planner.shutdown().await.unwrap();
 }

@@ -11,7 +11,7 @@ mod common;
 use clap::Parser;
 use cpn::archive::{self, Tensors};
 use cpn::loss::Precision;
-use cpn::{MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
+use cpn::{Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
 use serde_json::json;
 use std::io::{self, BufRead};
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Instant;
 use tch::Tensor;
-use trainer::dataset::Dataset;
+use trainer::dataset::{Dataset, Frames};
 use trainer::learner::{Learner, StageTimes};
 use trainer::sampler::Sampler;
 
@@ -91,10 +91,9 @@ fn write(path: &Path, args: &Args) {
     for seed in 0..EPISODES {
         common::keep(&folder, &common::episode("noise", seed, STEPS));
     }
-    let dataset = Dataset::load(&folder, &[]).unwrap();
+    let dataset = Dataset::load(&folder, &[], Input::Image).unwrap();
     let sampler = Sampler::new(&dataset, &recipe, SEED);
-    let frames = dataset.episodes().iter().map(|episode| episode.action_count + 1).sum::<usize>();
-    let pixels: Vec<u8> = (0..frames).flat_map(|index| dataset.frame(index)).copied().collect();
+    let Frames::Pixels(pixels) = dataset.frames() else { panic!("expected images") };
     let samples: Vec<_> =
         (0..).flat_map(|epoch| sampler.epoch(epoch)).take(BATCHES * recipe.training.batch_size).collect();
     let index = |step: fn(&trainer::sampler::Sample) -> u32| {
@@ -105,7 +104,7 @@ fn write(path: &Path, args: &Args) {
     let made: Vec<_> = samples.chunks(recipe.training.batch_size).map(|samples| sampler.batch(0, samples)).collect();
     let stack = |part: fn(&cpn::loss::Batch) -> &Tensor| Tensor::stack(&made.iter().map(part).collect::<Vec<_>>(), 0);
     let mut tensors = Tensors::from([
-        ("frames".to_owned(), images::from_bytes(&pixels).unwrap()),
+        ("frames".to_owned(), images::from_bytes(pixels).unwrap()),
         ("observation_index".to_owned(), index(|sample| sample.step)),
         ("goal_index".to_owned(), index(|sample| sample.goal)),
         ("actions".to_owned(), stack(|batch| &batch.actions)),
@@ -135,7 +134,7 @@ fn train(path: &Path, threads: usize) {
         checkpoint::copy_weights(&weights, &learner.agent).unwrap();
         learner
     };
-    let dataset = Dataset::load(&recordings(path), &[]).unwrap();
+    let dataset = Dataset::load(&recordings(path), &[], Input::Image).unwrap();
     let sampler = Sampler::new(&dataset, &recipe, SEED);
     thread::scope(|scope| {
         let (sender, batches) = mpsc::sync_channel(1);

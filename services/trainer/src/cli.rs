@@ -103,7 +103,7 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// What to train: paper-bc, paper-te-bc, paper-upn, paper-cpn or cpn [default: cpn].
+    /// What to train: paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn or jenga [default: cpn].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     preset: Option<String>,
@@ -150,7 +150,7 @@ pub struct TrainerArgs {
 /// What was typed.
 #[derive(Debug, Args)]
 pub struct PresetArgs {
-    /// One of paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn.
+    /// One of paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn, jenga.
     #[arg(default_value = "cpn")]
     pub name: String,
 }

@@ -1,25 +1,35 @@
-//! The demonstrations of a training run, in memory: every frame as bytes, side by side.
+//! The demonstrations of a training run, in memory: every frame as bytes or as a position, side by side.
 
 use crate::frame;
 use crate::recordings::{self, dataset_digest};
 use anyhow::{Context, ensure};
-use cpn::images;
+use cpn::{Input, images};
 use rayon::prelude::*;
+use recording::Episode as Recording;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use wire::Error;
 use wire::demonstration::RecordedEpisode;
 
 /// Every frame and action of every episode that is not held out.
 #[derive(Debug)]
 pub struct Dataset {
-    /// `[frames, 84, 84, 3]`, episode after episode.
-    pixels: Vec<u8>,
-    /// `[actions, A]`, likewise.
+    frames: Frames,
+    /// `[actions, A]`, episode after episode.
     actions: Vec<f32>,
     action_size: usize,
     episodes: Vec<Episode>,
     infos: Vec<RecordedEpisode>,
     digest: String,
+}
+
+/// What was observed, episode after episode.
+#[derive(Debug)]
+pub enum Frames {
+    /// Camera images, `[frames, 84, 84, 3]`.
+    Pixels(Vec<u8>),
+    /// Positions of the hand, in metres. The last of an episode is where it was to go, which is only ever a goal.
+    Positions(Vec<[f32; 3]>),
 }
 
 /// Where an episode lies: T actions, and T + 1 frames before, between and after them.
@@ -34,12 +44,13 @@ pub struct Episode {
 }
 
 impl Dataset {
-    /// Reads every episode of `folder` but those of the `held_out` tasks.
+    /// Reads every episode of `folder` but those of the `held_out` tasks, as images or as positions.
     ///
     /// # Errors
-    /// If a recording is damaged, the episodes differ in the size of their actions or in how they were rendered, none is
-    /// left, or a held-out task has none, which is more likely a slip of the pen than meant.
-    pub fn load(folder: &Path, held_out: &[String]) -> anyhow::Result<Self> {
+    /// If a recording is damaged or has no positions where these are asked for, the episodes differ in the size of their
+    /// actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
+    /// pen than meant.
+    pub fn load(folder: &Path, held_out: &[String], input: Input) -> anyhow::Result<Self> {
         let all_tasks = recordings::tasks(folder)?;
         for task in held_out {
             ensure!(all_tasks.contains(task), "hold_out: expected some of {all_tasks:?}, got {task:?}");
@@ -50,7 +61,7 @@ impl Dataset {
         ensure!(!paths.is_empty(), "{}: expected demonstrations, got none", folder.display());
         // The headers tell how much room everything takes; then each core fills in episodes.
         let infos = paths.par_iter().map(|path| header(path)).collect::<anyhow::Result<Vec<_>>>()?;
-        let (mut episodes, mut frames) = (Vec::with_capacity(infos.len()), 0);
+        let (mut episodes, mut count) = (Vec::with_capacity(infos.len()), 0);
         for (path, info) in paths.iter().zip(&infos) {
             let (expected, got) = (&infos[0].render_spec, &info.render_spec);
             let path = path.display();
@@ -59,15 +70,21 @@ impl Dataset {
                 "{path}: render_spec: expected {expected:?} like the episodes before, got {got:?}"
             );
             let action_count = info.steps as usize - 1;
-            episodes.push(Episode { first_frame: frames, first_action: frames - episodes.len(), action_count });
-            frames += action_count + 1;
+            episodes.push(Episode { first_frame: count, first_action: count - episodes.len(), action_count });
+            count += action_count + 1;
         }
-        let mut pixels = vec![0; frames * images::BYTES];
-        let read = slots(&mut pixels, &episodes)
-            .into_par_iter()
-            .zip(&paths)
-            .map(|(slot, path)| read(folder, path, slot).with_context(|| path.display().to_string()))
-            .collect::<anyhow::Result<Vec<_>>>()?;
+        let (frames, read) = match input {
+            Input::Image => {
+                let mut pixels = vec![0; count * images::BYTES];
+                let read = fill(slots(&mut pixels, images::BYTES, &episodes), folder, &paths, copy_pixels)?;
+                (Frames::Pixels(pixels), read)
+            }
+            Input::Position => {
+                let mut positions = vec![[0.0; 3]; count];
+                let read = fill(slots(&mut positions, 1, &episodes), folder, &paths, copy_positions)?;
+                (Frames::Positions(positions), read)
+            }
+        };
         let action_size = read[0].1;
         for ((_, got), path) in read.iter().zip(&paths) {
             let path = path.display();
@@ -78,7 +95,7 @@ impl Dataset {
         }
         let actions = read.into_iter().flat_map(|(actions, _)| actions).collect();
         let digest = dataset_digest(&infos);
-        Ok(Self { pixels, actions, action_size, episodes, infos, digest })
+        Ok(Self { frames, actions, action_size, episodes, infos, digest })
     }
 
     /// Names of the tasks, in order.
@@ -86,9 +103,12 @@ impl Dataset {
         self.infos.iter().map(|info| info.variation.task.as_str()).collect()
     }
 
-    /// How every frame was rendered; empty for those of a real camera.
+    /// How every frame was rendered; empty for those of a real camera and for positions.
     pub fn render_spec(&self) -> &str {
-        &self.infos[0].render_spec
+        match self.frames {
+            Frames::Pixels(_) => &self.infos[0].render_spec,
+            Frames::Positions(_) => "",
+        }
     }
 
     /// The episodes, in the order of their files.
@@ -111,9 +131,9 @@ impl Dataset {
         &self.digest
     }
 
-    /// The bytes `[84, 84, 3]` of a frame.
-    pub fn frame(&self, index: usize) -> &[u8] {
-        &self.pixels[index * images::BYTES..][..images::BYTES]
+    /// What was observed.
+    pub fn frames(&self) -> &Frames {
+        &self.frames
     }
 
     /// The actions `[count, A]` from one on.
@@ -122,33 +142,63 @@ impl Dataset {
     }
 }
 
-fn header(path: &PathBuf) -> anyhow::Result<RecordedEpisode> {
+fn header(path: &Path) -> anyhow::Result<RecordedEpisode> {
     let info = recording::read_header(path).with_context(|| path.display().to_string())?;
     ensure!(info.steps >= 2, "{}: steps: expected at least 2, got {}", path.display(), info.steps);
     Ok(info)
 }
 
-/// Cuts the pixels into those of each episode.
-fn slots<'a>(mut pixels: &'a mut [u8], episodes: &[Episode]) -> Vec<&'a mut [u8]> {
+/// Cuts the frames, `size` values each, into those of each episode.
+fn slots<'a, T>(mut frames: &'a mut [T], size: usize, episodes: &[Episode]) -> Vec<&'a mut [T]> {
     let cut = |episode: &Episode| {
-        let (slot, rest) = std::mem::take(&mut pixels).split_at_mut((episode.action_count + 1) * images::BYTES);
-        pixels = rest;
+        let (slot, rest) = std::mem::take(&mut frames).split_at_mut((episode.action_count + 1) * size);
+        frames = rest;
         slot
     };
     episodes.iter().map(cut).collect()
 }
 
-/// Copies an episode's frames into their place; answers its actions `[T, A]` and A.
-fn read(folder: &Path, path: &Path, slot: &mut [u8]) -> anyhow::Result<(Vec<f32>, usize)> {
-    let episode = recordings::read(folder, path)?;
-    let steps = episode.steps();
-    let (expected, got) = (slot.len() / images::BYTES, steps.len());
-    ensure!(expected == got, "steps: expected {expected} as the header says, got {got}");
-    for (place, step) in slot.chunks_exact_mut(images::BYTES).zip(steps) {
+/// Lets `copy` put each episode's frames into its slot; answers its actions `[T, A]` and A.
+fn fill<T: Send>(
+    slots: Vec<&mut [T]>,
+    folder: &Path,
+    paths: &[PathBuf],
+    copy: impl Fn(&Recording, &mut [T]) -> anyhow::Result<()> + Sync,
+) -> anyhow::Result<Vec<(Vec<f32>, usize)>> {
+    let read = |(slot, path): (&mut [T], &PathBuf)| {
+        let episode = recordings::read(folder, path)?;
+        copy(&episode, slot).with_context(|| path.display().to_string())?;
+        let actions: Vec<f32> = episode.steps().iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
+        let size = actions.len() / (episode.steps().len() - 1);
+        Ok((actions, size))
+    };
+    slots.into_par_iter().zip(paths).map(read).collect()
+}
+
+fn copy_pixels(episode: &Recording, slot: &mut [u8]) -> anyhow::Result<()> {
+    check_count(slot.len() / images::BYTES, episode)?;
+    for (place, step) in slot.chunks_exact_mut(images::BYTES).zip(episode.steps()) {
         frame::check(step)?;
         place.copy_from_slice(step.frame.data());
     }
-    let actions: Vec<f32> = steps.iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
-    let size = actions.len() / (steps.len() - 1);
-    Ok((actions, size))
+    Ok(())
+}
+
+fn copy_positions(episode: &Recording, slot: &mut [[f32; 3]]) -> anyhow::Result<()> {
+    check_count(slot.len(), episode)?;
+    let position = |values: &[f32], field: String, expected| {
+        values.first_chunk().copied().ok_or_else(|| Error::invalid(field, expected, values.len()))
+    };
+    for (place, step) in slot.iter_mut().zip(episode.steps()) {
+        *place = position(&step.state, format!("steps[{}].state", step.step), "at least 3 values")?;
+    }
+    let goal = position(&episode.info().goal_position, "goal_position".into(), "3 values")?;
+    slot[slot.len() - 1] = goal;
+    Ok(())
+}
+
+fn check_count(expected: usize, episode: &Recording) -> anyhow::Result<()> {
+    let got = episode.steps().len();
+    ensure!(expected == got, "steps: expected {expected} as the header says, got {got}");
+    Ok(())
 }

@@ -6,8 +6,8 @@ mod cli;
 use anyhow::{anyhow, bail, ensure};
 use clap::Parser;
 use cli::{
-    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, StartArgs, StopArgs, TrainerArgs,
-    VerifyArgs, VersionsArgs, WatchArgs,
+    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, StartArgs, StopArgs,
+    TrainerArgs, VerifyArgs, VersionsArgs, WatchArgs,
 };
 use comfy_table::{LineStyle, Table, presets};
 use cpn::Preset;

@@ -1,10 +1,10 @@
 //! Which samples a training run sees, in which order, towards which goals: a function of the data, the recipe and the seed.
 
 use crate::augment::Look;
-use crate::dataset::{Dataset, Episode};
-use cpn::images;
+use crate::dataset::{Dataset, Episode, Frames};
 use cpn::loss::Batch;
 use cpn::recipe::{GoalSampling, Recipe, Training};
+use cpn::{images, positions};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -100,15 +100,14 @@ impl<'a> Sampler<'a> {
     /// The tensors of some samples, those of step `step` of the run, which decides how the images are changed.
     pub fn batch(&self, step: u64, samples: &[Sample]) -> Batch {
         let (horizon, size) = (self.horizon, self.dataset.action_size());
-        let mut frames =
-            Frames { sampler: self, step, places: HashMap::new(), looks: HashMap::new(), pixels: Vec::new() };
+        let mut rows = Rows { dataset: self.dataset, places: HashMap::new(), frames: Vec::new() };
         let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         let mut actions = vec![0.0; samples.len() * horizon * size];
         let mut mask = vec![0.0; samples.len() * horizon];
         for (row, sample) in samples.iter().enumerate() {
-            observations.push(frames.place(sample.episode, sample.step));
+            observations.push(rows.place(sample.episode, sample.step));
             // Any frame will do for a method that does not look.
-            goals.push(frames.place(sample.episode, if self.needs_goal { sample.goal } else { sample.step }));
+            goals.push(rows.place(sample.episode, if self.needs_goal { sample.goal } else { sample.step }));
             let episode = &self.dataset.episodes()[sample.episode as usize];
             for t in 0..horizon {
                 let at = row * horizon + t;
@@ -119,11 +118,29 @@ impl<'a> Sampler<'a> {
         }
         let (batch, horizon) = (samples.len() as i64, horizon as i64);
         Batch {
-            frames: images::from_bytes(&frames.pixels).expect("whole frames, and at least one"),
+            frames: self.frames(step, &rows.frames),
             observations: Tensor::from_slice(&observations),
             goals: Tensor::from_slice(&goals),
             actions: Tensor::from_slice(&actions).view([batch, horizon, size as i64]),
             mask: Tensor::from_slice(&mask).view([batch, horizon]),
+        }
+    }
+
+    /// Some frames, each of an episode and at an index among all, as the encoder takes them.
+    fn frames(&self, step: u64, frames: &[(u32, usize)]) -> Tensor {
+        match self.dataset.frames() {
+            Frames::Pixels(pixels) => {
+                let (mut looks, mut changed) = (HashMap::new(), Vec::with_capacity(frames.len() * images::BYTES));
+                for &(episode, index) in frames {
+                    let draw = || Look::draw(self.training, self.seed, step, episode);
+                    let frame = &pixels[index * images::BYTES..][..images::BYTES];
+                    looks.entry(episode).or_insert_with(draw).append(frame, &mut changed);
+                }
+                images::from_bytes(&changed).expect("whole frames, and at least one")
+            }
+            Frames::Positions(all) => {
+                positions::from_metres(&frames.iter().map(|&(_, index)| all[index]).collect::<Vec<_>>())
+            }
         }
     }
 
@@ -143,26 +160,22 @@ impl<'a> Sampler<'a> {
 }
 
 /// The distinct frames of a batch.
-struct Frames<'a> {
-    sampler: &'a Sampler<'a>,
-    step: u64,
-    /// By frame, its row.
+struct Rows<'a> {
+    dataset: &'a Dataset,
+    /// By index among all frames, the row.
     places: HashMap<usize, i64>,
-    /// By episode, how its images are changed.
-    looks: HashMap<u32, Look>,
-    pixels: Vec<u8>,
+    /// By row, the episode and the index.
+    frames: Vec<(u32, usize)>,
 }
 
-impl Frames<'_> {
+impl Rows<'_> {
     /// The row of a frame, which is added if it is new.
     fn place(&mut self, episode: u32, step: u32) -> i64 {
-        let Sampler { dataset, training, seed, .. } = *self.sampler;
-        let index = dataset.episodes()[episode as usize].first_frame + step as usize;
-        let next = self.places.len() as i64;
+        let index = self.dataset.episodes()[episode as usize].first_frame + step as usize;
+        let next = self.frames.len() as i64;
         let place = *self.places.entry(index).or_insert(next);
         if place == next {
-            let look = self.looks.entry(episode).or_insert_with(|| Look::draw(training, seed, self.step, episode));
-            look.append(dataset.frame(index), &mut self.pixels);
+            self.frames.push((episode, index));
         }
         place
     }

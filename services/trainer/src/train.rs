@@ -59,7 +59,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     let Recipe { model, training } = &recipe;
     tch::set_num_threads(i32::try_from(config.threads).context("threads: expected a number of them")?);
     let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
-    let dataset = Dataset::load(&config.dataset, &config.hold_out)?;
+    let dataset = Dataset::load(&config.dataset, &config.hold_out, model.encoder.input())?;
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();

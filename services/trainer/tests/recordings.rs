@@ -5,10 +5,12 @@
 mod common;
 
 use common::{episode, files, info, keep, record, sessions, steps};
+use cpn::Input;
 use recording::Episode;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
+use trainer::dataset::Dataset;
 use trainer::ingest::Limits;
 use trainer::recordings::Recordings;
 use trainer::{mirror, replay, verify};
@@ -87,7 +89,7 @@ fn verify_tells_what_is_in_a_dataset() {
     assert_eq!(report.faults, Vec::<String>::new());
     let rows: Vec<_> = report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.rejected, t.steps_mean)).collect();
     assert_eq!(rows, [("push", 1, 0, 4.0), ("reach", 2, 1, 4.0)]);
-    assert_eq!(report.digest, trainer::dataset::Dataset::load(folder.path(), &[]).unwrap().digest());
+    assert_eq!(report.digest, Dataset::load(folder.path(), &[], Input::Image).unwrap().digest());
     let text = report.to_string();
     assert!(text.contains("reach") && text.contains(&report.digest), "{text}");
 }
@@ -142,7 +144,7 @@ fn a_recording_in_the_place_of_another_is_not_taken_for_it() {
     std::fs::rename(folder.path().join("reach/reach-2.mcap"), &wrong).unwrap();
     let faults = verify::run(folder.path(), 1, 1).unwrap().faults;
     assert!(matches!(&faults[..], [fault] if fault.contains("place: expected") && fault.contains("push/reach-2.mcap")));
-    let error = trainer::dataset::Dataset::load(folder.path(), &["reach".into()]).unwrap_err();
+    let error = Dataset::load(folder.path(), &["reach".into()], Input::Image).unwrap_err();
     assert!(format!("{error:#}").contains("place: expected"), "{error:#}");
     let recordings = Recordings::open(folder.path().to_owned()).unwrap();
     assert_eq!(recordings.get("reach-2"), None, "passed over, so that it can be recorded again");

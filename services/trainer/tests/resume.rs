@@ -40,7 +40,18 @@ impl Run {
     /// The real process; it saves its state after each step.
     fn start(&self, epochs: u64) -> Child {
         Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
-            .args(["train", "--json", "--preset", "paper-bc", "--set", "training.batch_size=2", "--seed", "4", "--threads", "1"])
+            .args([
+                "train",
+                "--json",
+                "--preset",
+                "paper-bc",
+                "--set",
+                "training.batch_size=2",
+                "--seed",
+                "4",
+                "--threads",
+                "1",
+            ])
             .args(["--save-interval-seconds", "0", "--set", &format!("training.epochs={epochs}")])
             .arg("--dataset")
             .arg(&self.data)

@@ -6,7 +6,7 @@ mod common;
 
 use common::{episode, keep, step};
 use cpn::recipe::GoalSampling;
-use cpn::{ModelConfig, Preset, Recipe, Training};
+use cpn::{Input, ModelConfig, Preset, Recipe, Training};
 use std::collections::{BTreeMap, BTreeSet};
 use tch::Tensor;
 use trainer::dataset::Dataset;
@@ -20,7 +20,7 @@ fn dataset() -> Dataset {
     for (seed, steps) in STEPS.into_iter().enumerate() {
         keep(folder.path(), &episode("reach", seed as u64, steps));
     }
-    Dataset::load(folder.path(), &[]).unwrap()
+    Dataset::load(folder.path(), &[], Input::Image).unwrap()
 }
 
 fn recipe(change: impl FnOnce(&mut Training)) -> Recipe {

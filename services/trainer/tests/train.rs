@@ -6,12 +6,12 @@ mod common;
 
 use common::{SPEC, episode, info, keep, steps};
 use cpn::recipe::GoalSampling;
-use cpn::{MethodKind, ModelConfig, Preset, Training, checkpoint};
+use cpn::{Input, MethodKind, ModelConfig, Preset, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
-use trainer::progress::{Observer, Progress, StopIf};
 use trainer::config::Config;
 use trainer::dataset::Dataset;
+use trainer::progress::{Observer, Progress, StopIf};
 use trainer::sampler::Sampler;
 use trainer::train::{self, Outcome};
 
@@ -140,7 +140,9 @@ fn settings_come_in_layers_over_a_preset() {
     let file = folder.path().join("settings.toml");
     std::fs::write(&file, "preset = \"paper-upn\"\ntraining.epochs = 7\nmodel.updates = 3\n").unwrap();
     let typed = serde_json::json!({"seed": 9});
-    let load = |changes: &[&str]| Config::load(Some(&file), &typed, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>());
+    let load = |changes: &[&str]| {
+        Config::load(Some(&file), &typed, &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>())
+    };
     let config = load(&["training.goals=hindsight", "model.encoder.latent=32"]).unwrap();
     assert_eq!((config.preset, config.seed, config.training.epochs), (Preset::PaperUpn, 9, 7));
     assert_eq!((config.model.updates, config.model.encoder.latent()), (3, 32));
@@ -159,8 +161,9 @@ fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
     let base = config(folder.path(), "short");
     let loss_of = |path: &Path| {
-        let agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
-        let dataset = Dataset::load(&base.dataset, &[]).unwrap();
+        let mut agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
+        agent.variables_mut().unfreeze();
+        let dataset = Dataset::load(&base.dataset, &[], Input::Image).unwrap();
         let recipe = base.recipe();
         let sampler = Sampler::new(&dataset, &recipe, 0);
         agent.outer_loss(&sampler.batch(0, &sampler.epoch(0))).double_value(&[])

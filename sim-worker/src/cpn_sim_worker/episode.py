@@ -54,7 +54,7 @@ class EpisodeRunner:
         if request.HasField("goal_seed"):
             self._solve(task, request.goal_seed, "goal_seed")
         goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
-        self._simulator.reset(task, seed)
+        state = self._simulator.reset(task, seed)
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
         return sim_pb2.ResetResponse(
             episode_id=self._episode.id,
@@ -62,6 +62,7 @@ class EpisodeRunner:
             observation=self._frame(),
             max_steps=self._max_steps,
             goal_position=goal_position,
+            hand_position=self._hand_position(state),
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
@@ -92,6 +93,7 @@ class EpisodeRunner:
             reward=transition.reward,
             success=episode.success,
             done=episode.done,
+            hand_position=self._hand_position(transition.state),
         )
         episode.latest = _Applied(action, response)
         return response, True
@@ -111,6 +113,9 @@ class EpisodeRunner:
             code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
             expected = "a seed whose variation the scripted expert solves"
             raise RequestError(code, field, expected, error.seed) from None
+
+    def _hand_position(self, state: NDArray[np.float64]) -> list[float]:
+        return state[: len(self._simulator.scene.goal_position)].tolist()
 
     def _frame(self) -> types_pb2.Image:
         return image_to_proto(self._simulator.frame(), str(self._simulator.render_spec))

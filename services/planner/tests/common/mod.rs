@@ -5,7 +5,7 @@
 
 use cpn::checkpoint::{self, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig};
-use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Random};
+use cpn::{Agent, EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
 use planner::model::Model;
 use planner::{Config, Planner};
@@ -183,7 +183,7 @@ pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
     proto::PlanRequest {
         model: model.into(),
         goal: Some(proto::plan_request::Goal::GoalImage(image(0))),
-        observation: Some(image(seed)),
+        observed: Some(proto::plan_request::Observed::Observation(image(seed))),
         seed,
         deadline_ms: 0,
         model_digest: String::new(),
@@ -223,9 +223,41 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
     });
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
     let training_tasks = vec!["door-lock".into(), "reach".into()];
-    let provenance =
-        Provenance { training_tasks, data_digest: "d".repeat(64), render_spec: render_spec.into(), seed, training: cpn::Training::paper() };
+    let provenance = Provenance {
+        training_tasks,
+        data_digest: "d".repeat(64),
+        render_spec: render_spec.into(),
+        seed,
+        training: cpn::Training::paper(),
+    };
     checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+}
+
+/// A checkpoint of few, random weights that plans from position to position.
+pub fn position_checkpoint(seed: u64) -> Vec<u8> {
+    let encoder = EncoderConfig::position([600, 0, 200], 100);
+    let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, actions: 3, ..ModelConfig::paper(MethodKind::Cpn) };
+    let provenance = Provenance {
+        training_tasks: vec!["jenga-poke".into()],
+        data_digest: "d".repeat(64),
+        render_spec: String::new(),
+        seed,
+        training: cpn::Training::paper(),
+    };
+    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+}
+
+/// A plan from one position to another.
+pub fn position_request(model: &str) -> proto::PlanRequest {
+    let (hand, goal) = (proto::Position { x: 0.5, y: 0.1, z: 0.2 }, proto::Position { x: 0.73, y: -0.09, z: 0.18 });
+    proto::PlanRequest {
+        model: model.into(),
+        goal: Some(proto::plan_request::Goal::GoalPosition(goal)),
+        observed: Some(proto::plan_request::Observed::Position(hand)),
+        seed: 0,
+        deadline_ms: 0,
+        model_digest: String::new(),
+    }
 }
 
 /// A method that says which seed it plans for and then waits to be let on.
@@ -277,6 +309,10 @@ impl Method for Gated {
         1
     }
 
+    fn takes(&self, _: Input) -> bool {
+        true
+    }
+
     fn encode(&self, images: &Tensor) -> Tensor {
         Random { actions: 4 }.encode(images)
     }
@@ -298,6 +334,10 @@ impl Method for Faulty {
 
     fn horizon(&self) -> i64 {
         1
+    }
+
+    fn takes(&self, _: Input) -> bool {
+        true
     }
 
     fn encode(&self, images: &Tensor) -> Tensor {

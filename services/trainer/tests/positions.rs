@@ -1,0 +1,122 @@
+//! Training runs on positions.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use common::{episode, info, keep, steps};
+use cpn::recipe::GoalSampling;
+use cpn::{Agent, Input, Method, Preset, Recipe, Training, checkpoint, positions};
+use recording::Episode;
+use std::path::Path;
+use tch::Tensor;
+use trainer::config::Config;
+use trainer::dataset::Dataset;
+use trainer::progress::StopIf;
+use trainer::sampler::Sampler;
+use trainer::train::{self, Outcome};
+use wire::demonstration::RecordedEpisode;
+
+/// A little past where the hands end, as a block lies past the hand that pokes it.
+const GOAL: [f32; 3] = [0.71, 0.0, 0.2];
+const STARTS: [[f32; 3]; 4] = [[0.65, -0.03, 0.2], [0.63, 0.02, 0.22], [0.64, 0.0, 0.17], [0.66, 0.03, 0.19]];
+const ACTIONS: u32 = 8;
+
+/// Where a hand is that goes straight, to 1 cm before the goal.
+fn hand(start: [f32; 3], step: u32) -> [f32; 3] {
+    let end = [GOAL[0] - 0.01, GOAL[1], GOAL[2]];
+    [0, 1, 2].map(|axis| start[axis] + (end[axis] - start[axis]) * step as f32 / ACTIONS as f32)
+}
+
+/// Its demonstration, an action of 1 being 1 cm.
+fn reach(seed: u64, start: [f32; 3]) -> Episode {
+    let mut steps = steps("poke", seed, ACTIONS + 1);
+    for step in &mut steps {
+        let (now, next) = (hand(start, step.step), hand(start, step.step + 1));
+        step.state = now.to_vec();
+        step.action = (step.step < ACTIONS).then(|| [0, 1, 2].map(|axis| (next[axis] - now[axis]) * 100.0).to_vec());
+    }
+    Episode::new(RecordedEpisode { goal_position: GOAL.to_vec(), ..info("poke", seed, &steps) }, steps).unwrap()
+}
+
+fn config(folder: &Path) -> Config {
+    let dataset = folder.join("data");
+    if !dataset.exists() {
+        STARTS.into_iter().zip(0..).for_each(|(start, seed)| keep(&dataset, &reach(seed, start)));
+    }
+    let config = Config::from(Preset::Jenga);
+    let training = Training { epochs: 150, batch_size: 16, ..config.training };
+    Config { dataset, out: folder.join("jenga.safetensors"), training, ..config }
+}
+
+fn distance(hand: [f32; 3]) -> f32 {
+    hand.iter().zip(GOAL).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
+}
+
+/// Where the hand is predicted to be after plan upon plan.
+fn end(agent: &Agent, mut hand: [f32; 3]) -> [f32; 3] {
+    let x_g = agent.encode(&positions::from_metres(&[GOAL]));
+    for _ in 0..ACTIONS {
+        let plan = agent.plan(&agent.encode(&positions::from_metres(&[hand])), &x_g, 0);
+        let action: Vec<f32> = Vec::try_from(plan.actions.select(1, 0).flatten(0, -1).clamp(-1.0, 1.0)).unwrap();
+        hand = [0, 1, 2].map(|axis| hand[axis] + action[axis] / 100.0);
+    }
+    hand
+}
+
+#[test]
+fn a_model_of_positions_learns_where_to_go() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(folder.path());
+    let outcome = train::run(&config, &mut StopIf(|_| false)).unwrap();
+    assert!(matches!(outcome, Outcome::Finished { .. }));
+    let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
+    assert_eq!((loaded.agent.config(), loaded.provenance.render_spec.as_str()), (&config.model, ""));
+    let start = [0.64, 0.01, 0.2];
+    let (before, after) = (distance(start), distance(end(&loaded.agent, start)));
+    assert!(after < before / 3.0, "{after} m from the goal, {before} m at the start");
+}
+
+#[test]
+fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let Config { dataset, .. } = config(folder.path());
+    let dataset = Dataset::load(&dataset, &[], Input::Position).unwrap();
+    let Recipe { model, training } = Preset::Jenga.recipe();
+    for goals in [GoalSampling::Final, GoalSampling::Hindsight] {
+        let recipe = Recipe { model: model.clone(), training: Training { goals, ..training.clone() } };
+        let sampler = Sampler::new(&dataset, &recipe, 0);
+        let samples = sampler.epoch(0);
+        let batch = sampler.batch(0, &samples);
+        assert_eq!(samples.len(), STARTS.len() * ACTIONS as usize);
+        assert_eq!(samples.iter().all(|sample| sample.goal == ACTIONS), goals == GoalSampling::Final);
+        for (row, sample) in samples.iter().enumerate() {
+            let at = |index: &Tensor| -> Vec<f32> {
+                Vec::try_from(batch.frames.get(index.int64_value(&[row as i64]))).unwrap()
+            };
+            let start = STARTS[sample.episode as usize];
+            assert_eq!(at(&batch.observations), hand(start, sample.step));
+            let expected = if sample.goal == ACTIONS { GOAL } else { hand(start, sample.goal) };
+            assert_eq!(at(&batch.goals), expected);
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(folder.path());
+    let refusal = |config: &Config| format!("{:#}", train::run(config, &mut StopIf(|_| false)).unwrap_err());
+    let images = folder.path().join("images");
+    keep(&images, &episode("reach", 1, 5));
+    let message = refusal(&Config { dataset: images, ..config.clone() });
+    assert!(message.ends_with("reach-1.mcap: goal_position: expected 3 values, got 0"), "{message}");
+    let of_images = Config { dataset: config.dataset.clone(), ..Config::from(Preset::Cpn) };
+    assert_eq!(refusal(&of_images), "model.actions: expected 3 as the demonstrations have, got 4");
+    let training = Training { shift_pixels: 4, ..config.training.clone() };
+    let message = refusal(&Config { training, ..config.clone() });
+    assert_eq!(message, "training.shift_pixels: expected 0 to 0, got 4");
+    let training = Training { colour_jitter: 0.1, ..config.training.clone() };
+    let message = refusal(&Config { training, ..config });
+    assert_eq!(message, "training.colour_jitter: expected 0 to 0, got 0.1");
+}
