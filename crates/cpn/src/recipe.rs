@@ -114,7 +114,8 @@ impl Preset {
                 model: ModelConfig {
                     encoder: EncoderConfig::position(JENGA_CENTRE_MM, JENGA_SCALE_MM),
                     actions: 3,
-                    horizon: 1,
+                    horizon: 8,
+                    updates: 2,
                     ..ModelConfig::paper(MethodKind::Cpn)
                 },
                 training: Training { epochs: 60, batch_size: 64, ..Training::paper() },
