@@ -6,7 +6,7 @@ mod common;
 
 use common::{episode, info, keep, steps};
 use cpn::recipe::GoalSampling;
-use cpn::{Agent, Input, Method, Preset, Recipe, Training, checkpoint, positions};
+use cpn::{Agent, Input, Method, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
 use recording::Episode;
 use std::path::Path;
 use tch::Tensor;
@@ -46,7 +46,9 @@ fn config(folder: &Path) -> Config {
     }
     let config = Config::from(Preset::Jenga);
     let training = Training { epochs: 150, batch_size: 16, ..config.training };
-    Config { dataset, out: folder.join("jenga.safetensors"), training, ..config }
+    // Short plans are learnt from the few demonstrations there are here.
+    let model = ModelConfig { horizon: 1, updates: 1, ..config.model };
+    Config { dataset, out: folder.join("jenga.safetensors"), model, training, ..config }
 }
 
 fn distance(hand: [f32; 3]) -> f32 {
