@@ -35,8 +35,10 @@ GROWTH = {
     "updates": (0, 1, 2),
     "batch": (32, 128, 512),
 }
-"""What grows of CPN, one at a time; the others are as in the paper, the batch 128. Longer plans of an untrained model leap, and
-no two libraries round a leap alike: their first losses could not be compared."""
+"""What grows of CPN, one at a time; the others are as in the paper, the batch 128.
+
+Longer plans of an untrained model leap, and no two libraries round a leap alike: first losses could not be compared.
+"""
 BATCH = 128
 FLOORS = {("bc", EAGER): 1.5, ("te-bc", EAGER): 1.5, ("cpn", EAGER): 4.0, ("cpn", JAX): 2.0}
 """Least ratios on one thread."""
