@@ -91,16 +91,16 @@ impl Encoder {
 
 /// Images `[B, 84, 84, 3]` as bfloat16 `[B, C, S, S]`, for a convolution with weights `[O, C, K, K]`, and its stride.
 ///
-/// Where blocks as large as the stride cut images and kernel evenly, they become channels: the same sums as a convolution
-/// of stride 1 with many channels, which the library computes far faster than one with three.
+/// With the stride of the paper's first convolution, and a kernel that its blocks cut evenly, these become channels: the
+/// same sums as a convolution of stride 1 with many channels, which the library computes far faster than one with three.
 fn in_blocks(images: &Tensor, weight: &Tensor, stride: i64) -> (Tensor, Tensor, i64) {
     let (outputs, channels, kernel, _) = weight.size4().expect("the weight of a convolution");
-    if kernel % stride != 0 || images::SIZE % stride != 0 {
+    if stride != images::BLOCK || kernel % stride != 0 {
         return (images.permute([0, 3, 1, 2]).to_kind(HALF), weight.shallow_clone(), stride);
     }
     let (count, side) = (kernel / stride, images::SIZE / stride);
     let weight = weight.view([outputs, channels, count, stride, count, stride]).permute([0, 3, 5, 1, 2, 4]);
-    let blocks = images::blocks(images, stride as usize).view([-1, side, side, stride * stride * channels]);
+    let blocks = images::blocks(images).view([-1, side, side, stride * stride * channels]);
     (blocks.permute([0, 3, 1, 2]), weight.reshape([outputs, -1, count, count]), 1)
 }
 

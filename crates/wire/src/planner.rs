@@ -1,8 +1,12 @@
 //! Requests to the planner service and its answers.
 
 use crate::message::{action, digest, name, required};
+pub use crate::search::{Search, Solver};
 use crate::{Error, Image, Message, Observation, Position, proto};
 use std::time::Duration;
+
+/// Most actions of a plan.
+const MAX_HORIZON: usize = 64;
 
 /// Where to plan to.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,6 +34,10 @@ pub struct PlanRequest {
     pub deadline: Option<Duration>,
     /// The checkpoint that must answer; any if none.
     pub model_digest: Option<String>,
+    /// How to search for the actions; the model's own way if none.
+    pub search: Option<Search>,
+    /// Actions to search from, horizon long; the policy's if there are none.
+    pub warm_start: Vec<Vec<f32>>,
 }
 
 /// A plan.
@@ -49,6 +57,12 @@ pub struct PlanResponse {
     pub model_digest: String,
     /// Id under which the goal is now registered.
     pub goal_id: String,
+    /// Iterations after which this plan was found.
+    pub iterations: u32,
+    /// Iterations that were run.
+    pub iterations_run: u32,
+    /// The plan moved on by one step; empty for methods that do not plan.
+    pub warm_start: Vec<Vec<f32>>,
 }
 
 /// Where the time of a request went, in seconds.
@@ -129,6 +143,13 @@ pub struct ModelInfo {
     pub version: u32,
 }
 
+fn actions(field: &str, actions: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Error> {
+    if actions.len() > MAX_HORIZON {
+        return Err(Error::invalid(field, format!("at most {MAX_HORIZON} actions"), actions.len()));
+    }
+    actions.into_iter().map(action).collect::<Result<_, _>>().map_err(|e| e.within(field))
+}
+
 impl Message for PlanRequest {
     type Proto = proto::PlanRequest;
 }
@@ -154,6 +175,10 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 Observation::Position(position.try_into().map_err(|e: Error| e.within("position"))?)
             }
         };
+        let search = request.search.map(Search::try_from).transpose().map_err(|e| e.within("search"))?;
+        if search.is_some_and(|search| search.anytime) && request.deadline_ms == 0 {
+            return Err(Error::invalid("deadline_ms", "a limit, for a search that goes on until then", 0));
+        }
         Ok(Self {
             model: name("model", request.model)?,
             goal,
@@ -163,6 +188,8 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
             model_digest: (!request.model_digest.is_empty())
                 .then(|| digest("model_digest", request.model_digest))
                 .transpose()?,
+            search,
+            warm_start: actions("warm_start", request.warm_start)?,
         })
     }
 }
@@ -183,6 +210,8 @@ impl From<PlanRequest> for proto::PlanRequest {
             seed: request.seed,
             deadline_ms: request.deadline.map_or(0, |d| u32::try_from(d.as_millis()).unwrap_or(u32::MAX)),
             model_digest: request.model_digest.unwrap_or_default(),
+            search: request.search.map(Into::into),
+            warm_start: request.warm_start.into_iter().map(|values| proto::Action { values }).collect(),
         }
     }
 }
@@ -198,12 +227,7 @@ impl TryFrom<proto::PlanResponse> for PlanResponse {
         let first_action = response.first_action.ok_or_else(|| Error::missing("first_action"))?;
         let times = response.times.unwrap_or_default();
         Ok(Self {
-            actions: response
-                .actions
-                .into_iter()
-                .map(action)
-                .collect::<Result<_, _>>()
-                .map_err(|e| e.within("actions"))?,
+            actions: actions("actions", response.actions)?,
             first_action: action(first_action).map_err(|e| e.within("first_action"))?,
             inner_losses: response.inner_losses,
             latent_distance: response.latent_distance,
@@ -214,6 +238,9 @@ impl TryFrom<proto::PlanResponse> for PlanResponse {
             },
             model_digest: digest("model_digest", response.model_digest)?,
             goal_id: digest("goal_id", response.goal_id)?,
+            iterations: response.iterations,
+            iterations_run: response.iterations_run,
+            warm_start: actions("warm_start", response.warm_start)?,
         })
     }
 }
@@ -229,6 +256,9 @@ impl From<PlanResponse> for proto::PlanResponse {
             times: Some(proto::StageTimes { queue_seconds, encode_seconds, plan_seconds }),
             model_digest: response.model_digest,
             goal_id: response.goal_id,
+            iterations: response.iterations,
+            iterations_run: response.iterations_run,
+            warm_start: response.warm_start.into_iter().map(|values| proto::Action { values }).collect(),
         }
     }
 }

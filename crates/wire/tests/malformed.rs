@@ -46,7 +46,11 @@ fn the_unspoiled_request_is_fine() {
 
 #[test]
 fn each_wrong_field_is_named() {
-    let cases: [(Error, &str, &str, &str); 12] = [
+    let search = |solver: proto::Solver, samples, anytime| {
+        Some(proto::Search { solver: solver.into(), samples, anytime, ..Default::default() })
+    };
+    let action = |count| proto::Action { values: vec![0.0; count] };
+    let cases: [(Error, &str, &str, &str); 17] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -84,6 +88,11 @@ fn each_wrong_field_is_named() {
             "-1000 to 1000 metres",
             "10000",
         ),
+        (refusal(|r| r.search = Some(proto::Search::default())), "search.solver", "GRADIENT, CEM, MPPI or HYBRID", "0"),
+        (refusal(|r| r.search = search(proto::Solver::Cem, 4097, false)), "search.samples", "at most 4096", "4097"),
+        (refusal(|r| r.search = search(proto::Solver::Gradient, 8, false)), "search.samples", "none for GRADIENT", "8"),
+        (refusal(|r| r.search = search(proto::Solver::Mppi, 8, true)), "deadline_ms", "a limit", "0"),
+        (refusal(|r| r.warm_start = vec![action(4); 65]), "warm_start", "at most 64 actions", "65"),
     ];
     for (error, field, expected, got) in cases {
         assert_eq!(error.code, Code::InvalidArgument);

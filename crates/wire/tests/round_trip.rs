@@ -40,6 +40,18 @@ fn point() -> impl Strategy<Value = Position> {
     proptest::array::uniform3(-1000.0f32..=1000.0).prop_map(|metres| Position::new(metres).unwrap())
 }
 
+fn search() -> impl Strategy<Value = Search> {
+    let solver = prop_oneof![Just(Solver::Gradient), Just(Solver::Cem), Just(Solver::Mppi), Just(Solver::Hybrid)];
+    (solver, option::of(1u32..=1000), option::of(2u32..=4096), any::<bool>()).prop_map(
+        |(solver, iterations, samples, anytime)| Search {
+            solver,
+            iterations,
+            samples: samples.filter(|_| solver != Solver::Gradient),
+            anytime,
+        },
+    )
+}
+
 fn recorded() -> impl Strategy<Value = RecordedEpisode> {
     (name(), variation(), 2..=MAX_STEPS, digest(), position(), 0.1..100.0, "\\PC{0,30}").prop_map(
         |(episode_id, variation, steps, digest, goal_position, control_hz, render_spec)| RecordedEpisode {
@@ -123,8 +135,12 @@ proptest! {
         seed in any::<u64>(),
         deadline in option::of((1u64..u64::from(u32::MAX)).prop_map(Duration::from_millis)),
         model_digest in option::of(digest()),
+        search in option::of(search()),
+        warm_start in vec(action(), 0..6),
     ) {
-        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest });
+        // A search that goes on until the deadline needs one.
+        let deadline = deadline.or_else(|| search?.anytime.then_some(Duration::from_millis(1)));
+        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start });
     }
 
     #[test]
@@ -136,9 +152,22 @@ proptest! {
         (queue_seconds, encode_seconds, plan_seconds) in (0.0..1.0, 0.0..1.0, 0.0..1.0),
         model_digest in digest(),
         goal_id in digest(),
+        (iterations, iterations_run) in any::<(u32, u32)>(),
+        warm_start in vec(action(), 0..6),
     ) {
         let times = StageTimes { queue_seconds, encode_seconds, plan_seconds };
-        survives(PlanResponse { actions, first_action, inner_losses, latent_distance, times, model_digest, goal_id });
+        survives(PlanResponse {
+            actions,
+            first_action,
+            inner_losses,
+            latent_distance,
+            times,
+            model_digest,
+            goal_id,
+            iterations,
+            iterations_run,
+            warm_start,
+        });
     }
 
     #[test]

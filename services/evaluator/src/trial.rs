@@ -82,6 +82,8 @@ pub(crate) async fn attempt(
             deadline: Some(link.timeout),
             // The one that the run began with, though the planner may swap.
             model_digest: Some(model.digest.clone()),
+            search: None,
+            warm_start: Vec::new(),
         };
         let mut plan = link.plan(request(&goal)).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {

@@ -60,7 +60,7 @@ impl PlannerCore {
     /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline, model_digest } = request;
+        let PlanRequest { model, goal, observation, seed, deadline, model_digest, .. } = request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
         }

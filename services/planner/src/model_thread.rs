@@ -218,6 +218,9 @@ impl Owner {
             },
             model_digest: model.info.digest.clone(),
             goal_id: task.goal_id.clone(),
+            iterations: 0,
+            iterations_run: 0,
+            warm_start: Vec::new(),
         })
     }
 }

@@ -21,6 +21,7 @@ mod gate;
 mod gated;
 mod lanes;
 mod linear;
+mod matrix;
 mod modulation;
 mod network;
 mod outer;

@@ -185,8 +185,7 @@ pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
         goal: Some(proto::plan_request::Goal::GoalImage(image(0))),
         observed: Some(proto::plan_request::Observed::Observation(image(seed))),
         seed,
-        deadline_ms: 0,
-        model_digest: String::new(),
+        ..Default::default()
     }
 }
 
@@ -255,8 +254,7 @@ pub fn position_request(model: &str) -> proto::PlanRequest {
         goal: Some(proto::plan_request::Goal::GoalPosition(goal)),
         observed: Some(proto::plan_request::Observed::Position(hand)),
         seed: 0,
-        deadline_ms: 0,
-        model_digest: String::new(),
+        ..Default::default()
     }
 }
 

@@ -1,0 +1,168 @@
+//! Products of matrices, by a kernel whose sums do not depend on how many rows there are: each number of a product is summed
+//! along the inner dimension in order, so that a row comes out the same, bit for bit, alone or among others.
+
+use super::lanes::Lanes;
+use super::real::Real;
+use pulp::{Arch, Simd, WithSimd};
+use std::marker::PhantomData;
+
+/// Registers side by side in a panel.
+const REGISTERS: usize = 2;
+/// Rows that are multiplied at once, as many as there are registers for.
+const ROWS: usize = 8;
+
+/// b of a product, `[inner, columns]`, in panels of as many columns as fill some registers.
+#[derive(Debug, Clone, Copy)]
+pub struct Matrix<'a, T> {
+    values: &'a [T],
+    inner: usize,
+    columns: usize,
+    /// From a row of a panel to the next.
+    stride: usize,
+    /// From a panel to the next.
+    apart: usize,
+}
+
+impl<'a, T: Real> Matrix<'a, T> {
+    /// `[inner, columns]`, row by row.
+    pub fn new(values: &'a [T], columns: usize) -> Self {
+        Self { values, inner: values.len() / columns, columns, stride: columns, apart: width::<T>() }
+    }
+}
+
+/// A matrix laid out panel by panel, so that products read it from one end to the other; the last panel is filled up with
+/// zeros.
+#[derive(Debug)]
+pub struct Panels<T> {
+    values: Vec<T>,
+    inner: usize,
+    columns: usize,
+}
+
+impl<T: Real> Panels<T> {
+    /// Lays out the transpose of `[columns, inner]`.
+    pub fn transposed(values: &[T], inner: usize) -> Self {
+        let (columns, width) = (values.len() / inner, width::<T>());
+        let mut panels = vec![T::ZERO; inner * columns.next_multiple_of(width)];
+        for (panel, rows) in panels.chunks_exact_mut(inner * width).zip(values.chunks(inner * width)) {
+            for (j, row) in rows.chunks_exact(inner).enumerate() {
+                for (k, value) in row.iter().enumerate() {
+                    panel[k * width + j] = *value;
+                }
+            }
+        }
+        Self { values: panels, inner, columns }
+    }
+
+    /// For a product.
+    pub fn matrix(&self) -> Matrix<'_, T> {
+        let (inner, columns, stride) = (self.inner, self.columns, width::<T>());
+        Matrix { values: &self.values, inner, columns, stride, apart: inner * stride }
+    }
+}
+
+/// c = a b, added to what is in c if `accumulate`: a is `[rows, inner]`, c `[rows, columns]`.
+pub fn multiply<T: Real>(accumulate: bool, c: &mut [T], a: &[T], b: Matrix<'_, T>) {
+    Arch::new().dispatch(Product { accumulate, c, a, b, turned: false });
+}
+
+/// c += aᵀ b: a is `[inner, rows]`, c `[rows, columns]`.
+pub fn accumulate_turned<T: Real>(c: &mut [T], a: &[T], b: Matrix<'_, T>) {
+    Arch::new().dispatch(Product { accumulate: true, c, a, b, turned: true });
+}
+
+/// How wide panels are on this processor.
+fn width<T: Real>() -> usize {
+    struct Width<T>(PhantomData<T>);
+    impl<T: Real> WithSimd for Width<T> {
+        type Output = usize;
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _simd: S) -> usize {
+            REGISTERS * Lanes::<S, T>::COUNT
+        }
+    }
+    Arch::new().dispatch(Width::<T>(PhantomData))
+}
+
+#[derive(Debug)]
+struct Product<'a, T> {
+    accumulate: bool,
+    c: &'a mut [T],
+    a: &'a [T],
+    b: Matrix<'a, T>,
+    /// Whether a is `[inner, rows]`.
+    turned: bool,
+}
+
+impl<T: Real> WithSimd for Product<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let Matrix { inner, columns, .. } = self.b;
+        let rows = self.c.len() / columns;
+        assert!(self.a.len() == rows * inner && self.c.len() == rows * columns, "shapes of a product");
+        for panel in 0..columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
+            let mut row = 0;
+            while row + ROWS <= rows {
+                self.tile::<S, ROWS>(simd, panel, row);
+                row += ROWS;
+            }
+            while row < rows {
+                self.tile::<S, 1>(simd, panel, row);
+                row += 1;
+            }
+        }
+    }
+}
+
+impl<T: Real> Product<'_, T> {
+    /// R rows of c, from `row` on, at a panel.
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize>(&mut self, simd: S, panel: usize, row: usize) {
+        let Matrix { inner, columns, stride, apart, values } = self.b;
+        let b = &values[panel * apart..];
+        let sums = if self.turned {
+            let rows = self.a.len() / inner;
+            sums::<S, T, R>(simd, inner, |r, k| self.a[k * rows + row + r], (b, stride))
+        } else {
+            let a: [&[T]; R] = std::array::from_fn(|r| &self.a[(row + r) * inner..][..inner]);
+            sums::<S, T, R>(simd, inner, |r, k| a[r][k], (b, stride))
+        };
+        let first = panel * REGISTERS * Lanes::<S, T>::COUNT;
+        for (r, sums) in sums.into_iter().enumerate() {
+            let line = &mut self.c[(row + r) * columns..][..columns][first..];
+            for (part, sum) in line.chunks_mut(Lanes::<S, T>::COUNT).zip(sums) {
+                if self.accumulate {
+                    sum.add_to(part);
+                } else {
+                    sum.store(part);
+                }
+            }
+        }
+    }
+}
+
+/// Along the inner dimension: R rows of a times a panel of b, whose rows are `stride` apart.
+#[inline(always)]
+fn sums<S: Simd, T: Real, const R: usize>(
+    simd: S,
+    inner: usize,
+    a: impl Fn(usize, usize) -> T,
+    (b, stride): (&[T], usize),
+) -> [[Lanes<S, T>; REGISTERS]; R] {
+    let count = Lanes::<S, T>::COUNT;
+    let mut sums = [[Lanes::splat(simd, T::ZERO); REGISTERS]; R];
+    for k in 0..inner {
+        let line = &b[k * stride..];
+        let b: [_; REGISTERS] = std::array::from_fn(|i| Lanes::load(simd, line.get(i * count..).unwrap_or_default()));
+        for r in 0..R {
+            let a = Lanes::splat(simd, a(r, k));
+            for i in 0..REGISTERS {
+                sums[r][i] = a.mul_add(b[i], sums[r][i]);
+            }
+        }
+    }
+    sums
+}

@@ -1,0 +1,84 @@
+//! How a plan is searched for.
+
+use crate::{Error, proto};
+
+/// Most iterations that can be asked for.
+const MAX_ITERATIONS: u32 = 1000;
+/// Most samples of a generation.
+const MAX_SAMPLES: u32 = 4096;
+
+/// A search for the actions whose predicted end is nearest to the goal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Search {
+    /// Which way.
+    pub solver: Solver,
+    /// Updates or generations; the default if none.
+    pub iterations: Option<u32>,
+    /// Plans in each generation; the default if none.
+    pub samples: Option<u32>,
+    /// Whether to go on for as long as the deadline allows.
+    pub anytime: bool,
+}
+
+/// Ways to search.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Solver {
+    /// Backpropagation through the predicted states.
+    Gradient,
+    /// The cross-entropy method.
+    Cem,
+    /// Model predictive path integral control.
+    Mppi,
+    /// CEM whose mean takes a step down the gradient after each generation.
+    Hybrid,
+}
+
+impl TryFrom<proto::Search> for Search {
+    type Error = Error;
+
+    fn try_from(search: proto::Search) -> Result<Self, Error> {
+        let solver = match proto::Solver::try_from(search.solver) {
+            Ok(proto::Solver::Gradient) => Solver::Gradient,
+            Ok(proto::Solver::Cem) => Solver::Cem,
+            Ok(proto::Solver::Mppi) => Solver::Mppi,
+            Ok(proto::Solver::Hybrid) => Solver::Hybrid,
+            Ok(proto::Solver::Unspecified) | Err(_) => {
+                return Err(Error::invalid("solver", "GRADIENT, CEM, MPPI or HYBRID", search.solver));
+            }
+        };
+        let samples = at_most("samples", MAX_SAMPLES, search.samples)?;
+        if solver == Solver::Gradient && samples.is_some() {
+            return Err(Error::invalid("samples", "none for GRADIENT", search.samples));
+        }
+        if samples == Some(1) {
+            return Err(Error::invalid("samples", format!("2 to {MAX_SAMPLES}, or 0"), 1));
+        }
+        let iterations = at_most("iterations", MAX_ITERATIONS, search.iterations)?;
+        Ok(Self { solver, iterations, samples, anytime: search.anytime })
+    }
+}
+
+impl From<Search> for proto::Search {
+    fn from(search: Search) -> Self {
+        let solver = match search.solver {
+            Solver::Gradient => proto::Solver::Gradient,
+            Solver::Cem => proto::Solver::Cem,
+            Solver::Mppi => proto::Solver::Mppi,
+            Solver::Hybrid => proto::Solver::Hybrid,
+        };
+        Self {
+            solver: solver.into(),
+            iterations: search.iterations.unwrap_or_default(),
+            samples: search.samples.unwrap_or_default(),
+            anytime: search.anytime,
+        }
+    }
+}
+
+/// A number, none if it is 0.
+fn at_most(field: &str, most: u32, value: u32) -> Result<Option<u32>, Error> {
+    if value > most {
+        return Err(Error::invalid(field, format!("at most {most}"), value));
+    }
+    Ok((value > 0).then_some(value))
+}
