@@ -75,15 +75,15 @@ pub(crate) async fn attempt(
     let mut frames = vec![reset.observation];
     for step in 0..reset.max_steps {
         let request = |goal: &Goal| PlanRequest {
-            model: model.name.clone(),
-            goal: goal.clone(),
-            observation: hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
             // The one that the run began with, though the planner may swap.
             model_digest: Some(model.digest.clone()),
-            search: None,
-            warm_start: Vec::new(),
+            ..PlanRequest::new(
+                &model.name,
+                goal.clone(),
+                hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
+            )
         };
         let mut plan = link.plan(request(&goal)).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
@@ -257,6 +257,9 @@ mod tests {
                     times: wire::planner::StageTimes { plan_seconds: 0.5, ..Default::default() },
                     model_digest: DIGEST.into(),
                     goal_id: image(255).digest(),
+                    iterations: 0,
+                    iterations_run: 0,
+                    warm_start: Vec::new(),
                 })
             };
             query::reply(query, result).unwrap();

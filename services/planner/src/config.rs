@@ -23,8 +23,14 @@ pub struct Config {
     /// Most checkpoints of a model that are kept after they were swapped out, for episodes that began with them; the least
     /// recently used go first.
     pub retired_capacity: NonZeroU16,
-    /// Threads libtorch uses for one plan.
+    /// Most plans that are made together.
+    pub batch_size: NonZeroU16,
+    /// How long a plan waits for company, in milliseconds.
+    pub batch_delay_ms: u16,
+    /// Threads that plans which are made together are spread over.
     pub threads: NonZeroU16,
+    /// Where Prometheus finds metrics; none are served if it is not given.
+    pub metrics_listen: Option<SocketAddr>,
     /// How the planner joins the others over zenoh.
     pub session: SessionConfig,
 }
@@ -41,7 +47,10 @@ impl Default for Config {
             queue_capacity: count(64),
             goal_capacity: count(1024),
             retired_capacity: count(3),
+            batch_size: count(64),
+            batch_delay_ms: 0,
             threads: count(1),
+            metrics_listen: None,
             session: SessionConfig::default(),
         }
     }
@@ -82,10 +91,22 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub retired_capacity: Option<NonZeroU16>,
-    /// Threads libtorch uses for one plan [default: 1].
+    /// Most plans that are made together [default: 64].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch_size: Option<NonZeroU16>,
+    /// How long a plan waits for company, in milliseconds [default: 0].
+    #[arg(long, value_name = "MS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch_delay_ms: Option<u16>,
+    /// Threads that plans which are made together are spread over [default: 1].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<NonZeroU16>,
+    /// Where Prometheus finds metrics, for example 127.0.0.1:9465 [default: nowhere].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub metrics_listen: Option<SocketAddr>,
     /// How to join the others.
     #[command(flatten)]
     pub session: SessionConfig,

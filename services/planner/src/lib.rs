@@ -1,7 +1,7 @@
 //! Serves plans from trained weights over zenoh and gRPC.
 //!
-//! [`core`] is the service; `grpc` and `zenoh` translate to it and nothing more. One thread (`model_thread`) owns every
-//! model ([`model`]); goals are kept beside it (`goals`). A model is replaced between two plans and only by one that has
+//! [`core`] is the service; `grpc` and `zenoh` translate to it and nothing more. One thread (`model_thread`, `owner`) owns every
+//! model ([`model`]) and plans together what waits together; goals are kept beside it (`goals`). A model is replaced between two plans and only by one that has
 //! planned once already.
 
 pub mod config;
@@ -9,15 +9,18 @@ pub mod core;
 mod follow;
 mod goals;
 mod grpc;
+mod load;
 pub mod model;
 mod model_thread;
+mod owner;
 mod served;
+mod task;
 mod zenoh;
 
 use crate::core::PlannerCore;
 use crate::zenoh::ZenohServer;
 pub use config::Config;
-use service_kit::GrpcServer;
+use service_kit::{GrpcServer, metrics};
 use std::net::SocketAddr;
 use std::time::Duration;
 use tracing::{info, warn};
@@ -38,8 +41,12 @@ pub struct Planner {
 /// Wants tokio's multi-threaded runtime: zenoh panics on the other.
 ///
 /// # Errors
-/// If a checkpoint is faulty, an address cannot be listened on, or the name cannot stand in a key.
+/// If a checkpoint is faulty, an address cannot be listened on, the name cannot stand in a key, or metrics are asked for twice
+/// in a process.
 pub async fn start(config: Config) -> anyhow::Result<Planner> {
+    if let Some(listen) = config.metrics_listen {
+        metrics::serve(listen)?;
+    }
     let core = PlannerCore::start(&config).await?;
     let grpc = grpc::start(core.clone(), config.grpc_listen).await?;
     let zenoh = ZenohServer::start(core.clone(), &config).await?;

@@ -3,7 +3,7 @@
 use crate::config::Config;
 use crate::core::PlannerCore;
 use crate::follow::Follower;
-use crate::model_thread::queue_full;
+use crate::task::queue_full;
 use anyhow::{anyhow, ensure};
 use std::future::{Future, ready};
 use std::sync::Arc;
