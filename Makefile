@@ -9,7 +9,7 @@ BENCH := benches/train/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-bench bench-sim bench-train lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -65,6 +65,9 @@ test-crash: setup ## Kill the recorder a hundred times
 
 test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
 	cargo test --workspace --locked --test swap -- --ignored --nocapture
+
+test-soak: setup ## Half an hour of everything at once against one planner: nothing fails, no memory grows
+	cargo test --workspace --locked --test soak -- --ignored --nocapture
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest

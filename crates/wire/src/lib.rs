@@ -15,6 +15,7 @@ pub mod planner;
 pub mod query;
 mod search;
 pub mod sim;
+pub mod trace;
 pub mod training;
 
 pub use error::{Code, Error};

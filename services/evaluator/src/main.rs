@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
-    service_kit::telemetry::init();
+    let _telemetry = service_kit::telemetry::init("cpn-eval")?;
     let (summary, json) = match Cli::parse().command {
         Command::Run(args) => (evaluator::run(&args).await?, args.json),
         Command::Report(args) => (evaluator::report(&args.out)?, args.json),

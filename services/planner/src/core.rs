@@ -11,7 +11,7 @@ use std::num::NonZeroU16;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
-use tracing::{info, warn};
+use tracing::{Span, info, warn};
 use wire::checkpoint::CheckpointManifest;
 use wire::planner::{
     CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
@@ -93,6 +93,7 @@ impl PlannerCore {
             deadline,
             search,
             warm_start,
+            span: Span::current(),
         };
         self.thread.plan(task).await
     }

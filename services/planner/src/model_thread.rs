@@ -11,6 +11,7 @@ use std::sync::{Arc, mpsc};
 use std::time::Instant;
 use std::{io, thread};
 use tokio::sync::{Semaphore, oneshot, watch};
+use tracing::debug_span;
 use wire::planner::{ModelInfo, PlanResponse};
 use wire::{Code, Error};
 
@@ -65,7 +66,8 @@ impl ModelThread {
         }
         let (reply, answer) = oneshot::channel();
         self.load.begin();
-        self.jobs.send(Job::Plan(Waiting { task, enqueued, place, reply })).map_err(|_| stopped())?;
+        let queued = debug_span!(parent: &task.span, "queue");
+        self.jobs.send(Job::Plan(Waiting { task, enqueued, queued, place, reply })).map_err(|_| stopped())?;
         let answer = match deadline {
             Some(deadline) => {
                 tokio::time::timeout_at((enqueued + deadline).into(), answer).await.map_err(|_| too_late(deadline))?

@@ -15,7 +15,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 use tokio::sync::{oneshot, watch};
-use tracing::error;
+use tracing::{debug_span, error};
 use wire::planner::{ModelInfo, PlanResponse, StageTimes};
 use wire::{Code, Error};
 
@@ -113,8 +113,8 @@ impl Owner {
     fn answer(&mut self, batch: Vec<Waiting>) {
         let started = Instant::now();
         let mut accepted = Vec::with_capacity(batch.len());
-        for Waiting { task, enqueued, place, reply } in batch {
-            drop(place);
+        for Waiting { task, enqueued, queued, place, reply } in batch {
+            drop((place, queued));
             // A client that gave up has closed its end.
             let late = task.deadline.filter(|deadline| started - enqueued >= *deadline);
             match late.map_or_else(|| self.check(&task), |deadline| Err(too_late(deadline))) {
@@ -124,7 +124,7 @@ impl Owner {
             }
         }
         let tasks: Vec<_> = accepted.iter().map(|(task, ..)| task).collect();
-        let Some(&(first, enqueued, _)) = accepted.first().as_ref() else { return };
+        let Some((first, enqueued, _)) = accepted.first() else { return };
         let mut clock = AnytimeClock::new(first.deadline, *enqueued);
         let mut plans = self.guarded(&tasks, &mut clock);
         if tasks.len() > 1 && plans.iter().any(Result::is_err) {
@@ -167,13 +167,17 @@ impl Owner {
         let model = models.get(model, model_digest.as_deref()).expect("checked");
         let digest = model.info.digest.clone();
         let started = Instant::now();
+        let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "encode")).collect();
         let (xs, x_gs) = encode(model, embeddings, tasks);
+        drop(spans);
         let encoded = Instant::now();
         let ends = xs.iter().zip(&x_gs);
         let queries = tasks.iter().zip(ends);
         let queries = queries.map(|(task, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start });
         let queries: Vec<_> = queries.collect();
+        let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "search")).collect();
         let planned = model.plan(&queries, *search, || load.tasks() <= tasks.len() && clock.has_time());
+        drop(spans);
         let times = StageTimes {
             queue_seconds: 0.0,
             encode_seconds: (encoded - started).as_secs_f64(),

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
+use tracing::Span;
 use wire::planner::{PlanResponse, Search};
 use wire::{Code, Error, Observation};
 
@@ -22,6 +23,8 @@ pub(crate) struct PlanTask {
     pub(crate) search: Option<Search>,
     /// `[H][A]`, or nothing.
     pub(crate) warm_start: Vec<Vec<f32>>,
+    /// Of the request.
+    pub(crate) span: Span,
 }
 
 /// A task in the queue.
@@ -29,6 +32,8 @@ pub(crate) struct PlanTask {
 pub(crate) struct Waiting {
     pub(crate) task: PlanTask,
     pub(crate) enqueued: Instant,
+    /// Of its time in the queue.
+    pub(crate) queued: Span,
     /// Given back when the plan starts.
     pub(crate) place: OwnedSemaphorePermit,
     pub(crate) reply: oneshot::Sender<Result<PlanResponse, Error>>,
