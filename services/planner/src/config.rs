@@ -16,6 +16,8 @@ pub struct Config {
     pub models_dir: PathBuf,
     /// Where gRPC listens; port 0 takes a free one.
     pub grpc_listen: SocketAddr,
+    /// Where clients of openpi are listened to; nowhere if none.
+    pub openpi_listen: Option<SocketAddr>,
     /// Most plan requests that wait for the model; one more is refused.
     pub queue_capacity: NonZeroU16,
     /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
@@ -44,6 +46,7 @@ impl Default for Config {
             name: "planner".into(),
             models_dir: "models".into(),
             grpc_listen: (Ipv4Addr::LOCALHOST, 50051).into(),
+            openpi_listen: None,
             queue_capacity: count(64),
             goal_capacity: count(1024),
             retired_capacity: count(3),
@@ -79,6 +82,10 @@ pub struct Args {
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grpc_listen: Option<SocketAddr>,
+    /// Where clients of openpi are listened to [default: nowhere].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub openpi_listen: Option<SocketAddr>,
     /// Most plan requests that wait for the model [default: 64].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
