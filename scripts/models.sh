@@ -9,10 +9,8 @@ held_out=door-lock,drawer-close,dial-turn,coffee-button
 
 scripts/dataset.sh
 
-# One run a core: the weights then are the same on any number of cores. Without the setting glibc gives the large blocks of
-# every step back to the kernel, and takes them anew at the next.
-export MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=4000000000
-# All methods are trained alike: the paper's networks, by the training of the preset cpn.
+# One run a core: the weights then are the same on any number of cores. All methods are trained alike: the paper's networks,
+# by the training of the preset cpn.
 printf '%s\n' cpn upn te-bc bc | xargs -P "$(nproc)" -I{} target/release/cpn-trainer train --threads 1 \
   --dataset data/demonstrations --preset paper-{} --set training.epochs=5 --set training.samples_per_draw=8 \
   --set training.precision=bfloat16 --hold-out "$held_out" --out models/{}.safetensors

@@ -20,6 +20,7 @@ mod history;
 pub mod ingest;
 pub mod journal;
 pub mod learner;
+pub mod memory;
 pub mod mirror;
 pub mod progress;
 pub mod publish;

@@ -21,7 +21,7 @@ use trainer::journal::Journal;
 use trainer::progress::{Bar, JsonLines, Observer, StopIf, print_line};
 use trainer::recordings::Recordings;
 use trainer::train::{self, Outcome};
-use trainer::{client, mirror, publish, replay, service, verify};
+use trainer::{client, memory, mirror, publish, replay, service, verify};
 use wire::training::{Run, RunState, StartRunRequest};
 use zenoh::Session;
 
@@ -34,6 +34,7 @@ async fn main() -> anyhow::Result<()> {
             serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await
         }
         Command::Train(arguments) => {
+            memory::keep()?;
             train(Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?, arguments.json).await
         }
         Command::Preset(arguments) => print_preset(&arguments),

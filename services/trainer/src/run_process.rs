@@ -22,9 +22,6 @@ const GRACE: Duration = Duration::from_secs(30);
 const MAX_LINE_BYTES: usize = 4096;
 /// How the names of variables begin that would override a run's settings.
 const VARIABLES: &str = "CPN_TRAIN_";
-/// Tells glibc to keep the large blocks of a step for the next one; otherwise the kernel takes them and clears them anew.
-const KEEP_MEMORY: [(&str, &str); 2] =
-    [("MALLOC_MMAP_THRESHOLD_", "4000000000"), ("MALLOC_TRIM_THRESHOLD_", "4000000000")];
 
 /// How a process ended.
 #[derive(Debug)]
@@ -62,7 +59,7 @@ pub(crate) async fn run(
             command.env_remove(name);
         }
         // The end of its log is the reason if it fails: that of the error, not of a stack.
-        command.envs(KEEP_MEMORY).env("RUST_LIB_BACKTRACE", "0");
+        command.env("RUST_LIB_BACKTRACE", "0");
         command.arg("train").arg("--json").arg("--config").arg(settings);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).kill_on_drop(true);
         attend(command, stop, hear).await

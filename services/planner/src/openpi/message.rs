@@ -67,19 +67,14 @@ pub(super) fn request(core: &PlannerCore, payload: &[u8]) -> Result<PlanRequest,
             return Err(Error::invalid(PROMPT, "none: the goal is a picture or a position", brief(&prompt)));
         }
     }
-    Ok(PlanRequest {
-        observation: one_of("observation", OBSERVATION, &mut fields)?,
-        goal: one_of("goal", GOAL, &mut fields)?,
-        model: match fields.remove(MODEL) {
-            Some(name) => text(name).map_err(|e| e.within(MODEL))?,
-            None => only_model(core)?,
-        },
-        seed: fields.remove(SEED).map_or(Ok(0), seed).map_err(|e| e.within(SEED))?,
-        deadline: None,
-        model_digest: None,
-        search: None,
-        warm_start: Vec::new(),
-    })
+    let observation = one_of("observation", OBSERVATION, &mut fields)?;
+    let goal = one_of("goal", GOAL, &mut fields)?;
+    let model = match fields.remove(MODEL) {
+        Some(name) => text(name).map_err(|e| e.within(MODEL))?,
+        None => only_model(core)?,
+    };
+    let seed = fields.remove(SEED).map_or(Ok(0), seed).map_err(|e| e.within(SEED))?;
+    Ok(PlanRequest { seed, ..PlanRequest::new(model, goal, observation) })
 }
 
 /// The value of the one field among `readers` that is there.
