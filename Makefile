@@ -5,7 +5,7 @@ TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXPORT := export/.venv
-BENCH := benches/train/.venv
+BENCH := benches/peers/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
@@ -34,8 +34,8 @@ $(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
 	cd export && $(UV) sync --quiet --locked
 	touch $@
 
-$(BENCH)/.ready: benches/train/pyproject.toml benches/train/uv.lock | $(UV)
-	cd benches/train && $(UV) sync --quiet --locked
+$(BENCH)/.ready: benches/peers/pyproject.toml benches/peers/uv.lock | $(UV)
+	cd benches/peers && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -69,14 +69,14 @@ test-swap: setup ## Swap checkpoints a thousand times under a steady load of pla
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-test-bench: $(BENCH)/.ready ## Check the mathematics of the training bench's peers, and its harness
-	cd benches/train && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
+	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
 	cd sim-worker && $(UV) run --quiet ../benches/sim.py
 
 bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JAX, in an environment of their own (QUICK=1 for a glance)
-	$(BENCH)/bin/python -m cpn_bench_train.bench --out runs/bench $(if $(QUICK),--quick) \
+	$(BENCH)/bin/python -m cpn_bench.train.bench --out runs/bench $(if $(QUICK),--quick) \
 		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench train_step --)"
 
 lint: setup ## Formatting, lints, types
