@@ -9,7 +9,7 @@ BENCH := benches/peers/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -78,6 +78,11 @@ bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-Wor
 bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JAX, in an environment of their own (QUICK=1 for a glance)
 	$(BENCH)/bin/python -m cpn_bench.train.bench --out runs/bench $(if $(QUICK),--quick) \
 		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench train_step --)"
+
+bench-plan: build $(BENCH)/.ready ## Compare plans with PyTorch, JAX and ONNX Runtime, and the service with LitServe (QUICK=1 for a glance)
+	$(BENCH)/bin/python -m cpn_bench.plan.bench --out runs/bench $(if $(QUICK),--quick) \
+		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench plan --)" \
+		--serve "$(or $(SERVE),cargo bench --quiet --workspace --locked --bench serve --)"
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check

@@ -9,12 +9,21 @@ from matplotlib.figure import Figure
 from cpn_bench.harness import Row
 
 
+def figure() -> Figure:
+    """An empty figure, for panels in a row."""
+    return Figure(figsize=(12, 3.2), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes text as text, and the same bytes for the same numbers."""
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "cpn"}):
+        figure.savefig(path, metadata={"Date": None})
+
+
 def draw(rows: Sequence[Row], growth: Mapping[str, Sequence[int]], label: str, path: Path) -> None:
     """A panel for everything that grows, a line for every contender; both axes are logarithmic where they can be."""
-    # Text as text, and the same bytes for the same numbers.
-    mpl.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "cpn"}
-    figure = Figure(figsize=(12, 3.2), layout="constrained")
-    panels = figure.subplots(1, len(growth), sharey=True)
+    wide = figure()
+    panels = wide.subplots(1, len(growth), sharey=True)
     for panel, (grown, values) in zip(panels, growth.items(), strict=True):
         of = {value: [row for row in rows if row.name == f"cpn, {grown} {value}"] for value in values}
         panel.plot(values, [of[value][0].ours for value in values], marker="o", label="ours")
@@ -25,4 +34,4 @@ def draw(rows: Sequence[Row], growth: Mapping[str, Sequence[int]], label: str, p
         panel.grid(visible=True, which="both", alpha=0.3)
     panels[0].set_ylabel(label)
     panels[-1].legend()
-    figure.savefig(path, metadata={"Date": None})
+    save(wide, path)

@@ -90,6 +90,12 @@ def pinned(threads: int) -> list[str]:
     return ["taskset", "--cpu-list", ",".join(map(str, cores))]
 
 
+def check_cores(threads: int) -> None:
+    """For a library that takes as many threads as there are cores to run on, as XLA does."""
+    if (cores := len(os.sched_getaffinity(0))) != threads:
+        raise ValueError(f"threads: expected {cores}, as the process may run on so many cores, got {threads}")
+
+
 def module(name: str, *options: str) -> list[str]:
     """The command of a module of ours, in this environment."""
     return [sys.executable, "-m", f"cpn_bench.{name}", *options]

@@ -8,7 +8,7 @@ import pytest
 from cpn_bench import chart, harness
 from cpn_bench.train import bench
 
-OURS = [sys.executable, str(Path(__file__).parent / "stand_in.py")]
+OURS = [sys.executable, str(Path(__file__).parent / "train_stand_in.py")]
 EFFORT = harness.Effort(turns=2, turn_seconds=0.05)
 
 

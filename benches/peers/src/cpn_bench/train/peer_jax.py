@@ -8,7 +8,6 @@ with channels first and with XLA's flags `ynn_fusion_type`, `use_onednn` and `fa
 patches.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ import optax
 import tyro
 from jax import Array
 
+from cpn_bench.harness import check_cores
 from cpn_bench.model import ModelConfig
 from cpn_bench.networks_jax import Weights, encode, plan, rollout
 from cpn_bench.train.batches import Batches
@@ -74,9 +74,7 @@ class Trainer:
 
 def main(batches: Path, method: str, threads: int) -> None:
     """Trains as asked on stdin."""
-    # XLA takes as many threads as there are cores to run on.
-    if (cores := len(os.sched_getaffinity(0))) != threads:
-        raise ValueError(f"threads: expected {cores}, as the process may run on so many cores, got {threads}")
+    check_cores(threads)
     serve(Trainer(Batches.read(batches, method)))
 
 
