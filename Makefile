@@ -5,12 +5,12 @@ TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXPORT := export/.venv
-BENCH := benches/train/.venv
+BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench bench-sim bench-train lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -35,8 +35,8 @@ $(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
 	cd export && $(UV) sync --quiet --locked
 	touch $@
 
-$(BENCH)/.ready: benches/train/pyproject.toml benches/train/uv.lock | $(UV)
-	cd benches/train && $(UV) sync --quiet --locked
+$(BENCH)/.ready: benches/peers/pyproject.toml benches/peers/uv.lock | $(UV)
+	cd benches/peers && $(UV) sync --quiet --locked
 	touch $@
 
 $(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock | $(UV)
@@ -81,15 +81,20 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo test --workspace --locked --test openpi
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-test-bench: $(BENCH)/.ready ## Check the mathematics of the training bench's peers, and its harness
-	cd benches/train && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
+	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
 	cd sim-worker && $(UV) run --quiet ../benches/sim.py
 
 bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JAX, in an environment of their own (QUICK=1 for a glance)
-	$(BENCH)/bin/python -m cpn_bench_train.bench --out runs/bench $(if $(QUICK),--quick) \
+	$(BENCH)/bin/python -m cpn_bench.train.bench --out runs/bench $(if $(QUICK),--quick) \
 		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench train_step --)"
+
+bench-plan: build $(BENCH)/.ready ## Compare plans with PyTorch, JAX and ONNX Runtime, and the service with LitServe (QUICK=1 for a glance)
+	$(BENCH)/bin/python -m cpn_bench.plan.bench --out runs/bench $(if $(QUICK),--quick) \
+		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench plan --)" \
+		--serve "$(or $(SERVE),cargo bench --quiet --workspace --locked --bench serve --)"
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check

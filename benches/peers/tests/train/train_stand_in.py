@@ -11,8 +11,8 @@ import tyro
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
-from cpn_bench_train.batches import Batches
-from cpn_bench_train.peer_torch import Trainer
+from cpn_bench.train.batches import Batches
+from cpn_bench.train.peer_torch import Trainer
 
 BATCHES, BATCH, FRAMES, LATENT, HIDDEN, ACTIONS = 3, 4, 7, 8, 6, 4
 

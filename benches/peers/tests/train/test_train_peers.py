@@ -1,6 +1,5 @@
 """The peers compute what the golden tensors of `tests/golden/reference.py` say, so that all contenders do the same."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,35 +9,31 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
 
-from cpn_bench_train import peer_jax, peer_torch
-from cpn_bench_train.batches import WEIGHT, Batches, ModelConfig
+from cpn_bench.model import read
+from cpn_bench.train import peer_jax, peer_torch
+from cpn_bench.train.batches import Batches
 
-GOLDEN = Path(__file__).resolve().parents[3] / "tests/golden"
+GOLDEN = Path(__file__).resolve().parents[4] / "tests/golden"
+GRADIENT = "gradient."
 Gradients = dict[str, NDArray[Any]]
 
 
 def golden(method: str) -> tuple[Batches, float, Gradients]:
     """One batch in float64, its outer loss and gradients."""
-    with safe_open(GOLDEN / f"{method}.safetensors", "numpy") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        model = ModelConfig.from_document(json.loads(file.metadata()["cpn"]))
-
-    def of(prefix: str) -> dict[str, NDArray[Any]]:
-        return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
+    model, weights, tensors = read(GOLDEN / f"{method}.safetensors")
     size = len(tensors["observations"])
     batches = Batches(
         model=model,
-        weights=of(WEIGHT),
+        weights=weights,
         frames=np.concatenate([tensors["observations"], tensors["goals"]]),
         observation_index=np.arange(size)[None],
         goal_index=np.arange(size, 2 * size)[None],
         actions=tensors["demonstrated"][None],
         mask=tensors["mask"][None],
     )
-    return batches, tensors["outer_loss"].item(), of("gradient.")
+    gradients = {name.removeprefix(GRADIENT): value for name, value in tensors.items() if name.startswith(GRADIENT)}
+    return batches, tensors["outer_loss"].item(), gradients
 
 
 def by_torch(batches: Batches, compiled: bool = False) -> tuple[float, Gradients]:

@@ -1,22 +1,29 @@
-"""How samples a second change as the model and the batch grow."""
+"""How rates change as the model and the batch grow."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-if TYPE_CHECKING:
-    from cpn_bench_train.bench import Row
+from cpn_bench.harness import Row
 
 
-def draw(rows: Sequence["Row"], growth: Mapping[str, Sequence[int]], path: Path) -> None:
+def figure() -> Figure:
+    """An empty figure, for panels in a row."""
+    return Figure(figsize=(12, 3.2), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes text as text, and the same bytes for the same numbers."""
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "cpn"}):
+        figure.savefig(path, metadata={"Date": None})
+
+
+def draw(rows: Sequence[Row], growth: Mapping[str, Sequence[int]], label: str, path: Path) -> None:
     """A panel for everything that grows, a line for every contender; both axes are logarithmic where they can be."""
-    # Text as text, and the same bytes for the same numbers.
-    mpl.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "cpn"}
-    figure = Figure(figsize=(12, 3.2), layout="constrained")
-    panels = figure.subplots(1, len(growth), sharey=True)
+    wide = figure()
+    panels = wide.subplots(1, len(growth), sharey=True)
     for panel, (grown, values) in zip(panels, growth.items(), strict=True):
         of = {value: [row for row in rows if row.name == f"cpn, {grown} {value}"] for value in values}
         panel.plot(values, [of[value][0].ours for value in values], marker="o", label="ours")
@@ -25,6 +32,6 @@ def draw(rows: Sequence["Row"], growth: Mapping[str, Sequence[int]], path: Path)
             panel.plot(values, rates, marker="o", label=peer)
         panel.set(xlabel=grown, yscale="log", xticks=values)
         panel.grid(visible=True, which="both", alpha=0.3)
-    panels[0].set_ylabel("samples/s, one thread")
+    panels[0].set_ylabel(label)
     panels[-1].legend()
-    figure.savefig(path, metadata={"Date": None})
+    save(wide, path)

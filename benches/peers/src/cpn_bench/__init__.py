@@ -1,0 +1,1 @@
+"""Planning and training in PyTorch, JAX and ONNX Runtime, and the turns they take with ours."""

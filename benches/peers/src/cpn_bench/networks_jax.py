@@ -1,0 +1,88 @@
+"""The networks in JAX, and how they plan: batched arrays with unrolled steps."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array, lax
+
+from cpn_bench.model import ModelConfig
+
+Weights = dict[str, Array]
+
+
+def linear(weights: Weights, name: str, x: Array) -> Array:
+    """`[B, inputs]` to `[B, outputs]`."""
+    return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+
+
+def gate(weights: Weights, name: str, x: Array) -> Array:
+    """An attenuation network, with one hidden layer: `[B, inputs]` to `[B, outputs]` in (0, 1)."""
+    return jax.nn.sigmoid(linear(weights, f"{name}.output", jax.nn.relu(linear(weights, f"{name}.hidden", x))))
+
+
+def dense(weights: Weights, name: str, x: Array) -> Array:
+    """A linear layer, neuromodulated where it has gates."""
+    if f"{name}.u.hidden.weight" not in weights:
+        return linear(weights, name, x)
+    weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+    attenuated = gate(weights, f"{name}.u", x).reshape(-1, *weight.shape) * weight
+    return jnp.einsum("boi,bi->bo", attenuated, x) + gate(weights, f"{name}.v", x) * bias
+
+
+def encode(weights: Weights, model: ModelConfig, images: Array) -> Array:
+    """`[B, 84, 84, 3]` bytes to `[B, Z]`."""
+    y = images.astype(weights["encoder.linear.weight"].dtype) / 255 - 0.5
+    for number, stride in enumerate(model.strides):
+        name = f"encoder.conv.{number}"
+        layout = ("NHWC", "OIHW", "NHWC")
+        y = lax.conv_general_dilated(y, weights[f"{name}.weight"], (stride, stride), "VALID", dimension_numbers=layout)
+        y = jax.nn.relu(y + weights[f"{name}.bias"])
+    # The linear layer's weights are those of an encoder with channels first.
+    x = linear(weights, "encoder.linear", y.transpose(0, 3, 1, 2).reshape(len(y), -1))
+    if model.layer_norm:
+        x = jax.nn.standardize(x, epsilon=1e-5) * weights["encoder.norm.weight"] + weights["encoder.norm.bias"]
+    return x
+
+
+def features(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
+    """What the trunk makes of a state."""
+    inputs = jnp.concatenate([x, goal], 1) if model.goal_conditioned else x
+    return jax.nn.relu(dense(weights, "network.trunk", inputs))
+
+
+def policy(weights: Weights, features: Array) -> Array:
+    """The action for a state's features."""
+    hidden = jax.nn.relu(dense(weights, "network.policy_0", features))
+    return jnp.tanh(dense(weights, "network.policy_1", hidden))
+
+
+def next_state(weights: Weights, x: Array, features: Array, action: Array) -> Array:
+    """The state after an action."""
+    hidden = jax.nn.relu(dense(weights, "network.dynamics_0", jnp.concatenate([features, action], 1)))
+    return x + dense(weights, "network.dynamics_1", hidden)
+
+
+def rollout(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
+    """The policy's actions along its own predicted states, `[B, H, A]`, from x to the goal, both `[B, Z]`."""
+    seen = features(weights, model, x, goal)
+    actions = [policy(weights, seen)]
+    for _ in range(model.horizon - 1):
+        x = next_state(weights, x, seen, actions[-1])
+        seen = features(weights, model, x, goal)
+        actions.append(policy(weights, seen))
+    return jnp.stack(actions, 1)
+
+
+def inner_loss(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
+    """Huber between the state predicted after the actions and the goal, summed: plans are independent."""
+    for step in range(model.horizon):
+        x = next_state(weights, x, features(weights, model, x, goal), actions[:, step])
+    return optax.losses.huber_loss(x, goal).sum()
+
+
+def plan(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
+    """The rollout, improved by gradient descent on the predicted distance to the goal."""
+    actions = rollout(weights, model, x, goal)
+    for _ in range(model.updates):
+        actions = actions - weights["step_size"] * jax.grad(inner_loss)(actions, weights, model, x, goal)
+    return actions

@@ -1,0 +1,158 @@
+"""Plans of ours, PyTorch, JAX and ONNX Runtime in turns, then of services; writes plan.json, plan.svg and load.svg.
+
+make bench-plan
+"""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import tyro
+
+from cpn_bench import chart, harness
+from cpn_bench.harness import COMPILED, CURVE, EAGER, JAX, MAIN, OURS, QUICK, Effort, Row, module
+from cpn_bench.plan import load_chart, service
+from cpn_bench.plan.model import PlanModel
+
+COMMAND = "make bench-plan"
+ONNX = "ONNX Runtime (forward only)"
+PEERS = {
+    EAGER: module("plan.peer_torch"),
+    COMPILED: module("plan.peer_torch", "--compile"),
+    JAX: module("plan.peer_jax"),
+    ONNX: module("plan.peer_onnx"),
+}
+BATCHES = (1, 64)
+GROWTH = {
+    "latent": (32, 64, 128),
+    "horizon": (1, 5, 10, 20),
+    "updates": (0, 1, 2, 4),
+}
+"""What grows of CPN, one at a time; the others are as in the paper, the batch 1."""
+UNIT = "plans/s"
+RELATIVE_TOLERANCE = ABSOLUTE_TOLERANCE = 1e-3
+"""Between the first plans of contenders."""
+LOAD_SECONDS, QUICK_LOAD_SECONDS = 10.0, 2.0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is planned with."""
+
+    method: str
+    batch: int = 1
+    threads: int = 1
+    grown: str | None = None
+    """What differs from the paper's values."""
+    value: int = 0
+
+    @property
+    def name(self) -> str:
+        """For rows and people."""
+        if self.grown:
+            return f"{self.method}, {self.grown} {self.value}"
+        return f"{self.method}, batch {self.batch}, {self.threads} thread{'s'[: self.threads > 1]}"
+
+
+FLOORS = {
+    (Setting("cpn").name, EAGER): 20.0,
+    (Setting("cpn").name, JAX): 2.0,
+    (Setting("cpn", batch=64).name, EAGER): 2.0,
+    (Setting("cpn", batch=64).name, COMPILED): 2.0,
+    (Setting("cpn", batch=64).name, JAX): 2.0,
+}
+"""Least ratios on one thread. ONNX Runtime, which plans less, has none."""
+
+
+@contextmanager
+def written_model(ours: Sequence[str], setting: Setting) -> Iterator[Path]:
+    """A file that ours writes for a setting."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.safetensors"
+        options = ["--write-model", str(path), "--method", setting.method]
+        if setting.grown:
+            options += [f"--{setting.grown}", str(setting.value)]
+        subprocess.run([*ours, *options], check=True, stdout=sys.stderr)
+        yield path
+
+
+def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort: Effort) -> list[Row]:
+    """Takes all in turns, and prints what they came to; answers a row for each peer."""
+    with written_model(ours, setting) as path:
+        options = ["--model", str(path), "--batch", str(setting.batch), "--threads", str(setting.threads)]
+        commands = {OURS: [*ours, *options]} | {peer: [*PEERS[peer], *options] for peer in peers}
+        with harness.contenders(commands, setting.threads) as started:
+            planners = [contender for contender in started if contender.name != ONNX]
+            harness.agree(planners, "actions", setting.name, RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE)
+            rates = harness.take_turns(started, effort) * setting.batch
+            stages = started[0].ask("stages")["stages"]
+        operations = PlanModel.read(path).operations
+    rows = harness.tell(setting.name, peers, rates, UNIT, COMMAND)
+    harness.print_stages(setting.name, f"a batch of {setting.batch}", stages)
+    rate = operations_per_second(setting.threads)
+    print(
+        f"{setting.name:24s} the {operations / 1e6:.1f} million operations of a plan's matrix products take "
+        f"{1e3 * operations / rate:.3f} ms at the {rate / 1e9:.0f} GFLOP/s of a large product",
+        flush=True,
+    )
+    return rows
+
+
+@cache
+def operations_per_second(threads: int) -> float:
+    """What this machine can do on so many cores."""
+    command = [*harness.pinned(threads), *module("plan.arithmetic", "--threads", str(threads))]
+    measured = subprocess.run(command, check=True, stdout=subprocess.PIPE)
+    return json.loads(measured.stdout)["operations_per_second"]
+
+
+def settings() -> list[Setting]:
+    """What all peers are compared in; on two cores where there are two."""
+    threads = (1, 2)[: len(os.sched_getaffinity(0))]
+    return [Setting("cpn", batch, count) for batch in BATCHES for count in threads] + [Setting("upn")]
+
+
+def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
+    """Compares everything, and writes the rows after each setting; returns what is wrong with them.
+
+    Args:
+        ours: The command of our contender.
+        serve: The command that measures our service.
+        out: Folder of the results.
+        quick: A few short turns against eager PyTorch and JAX, without growth: to see that it runs, not to quote.
+    """
+    command = shlex.split(ours)
+    rows: list[Row] = []
+
+    def keep(found: list[Row]) -> None:
+        rows.extend(found)
+        harness.write(rows, out / "plan.json")
+
+    peers, effort = ((EAGER, JAX), QUICK) if quick else (tuple(PEERS), MAIN)
+    for setting in settings():
+        keep(compare(command, peers, setting, effort))
+    if not quick:
+        for grown, values in GROWTH.items():
+            for value in values:
+                keep(compare(command, (EAGER, JAX), Setting("cpn", grown=grown, value=value), CURVE))
+        chart.draw(rows, GROWTH, f"{UNIT}, batch 1, one thread", out / "plan.svg")
+    with written_model(command, Setting("cpn")) as path:
+        measured = service.ours(shlex.split(serve))
+        measured += service.litserve(path, QUICK_LOAD_SECONDS if quick else LOAD_SECONDS)
+    service.tell(measured)
+    keep(service.rows(measured, COMMAND))
+    load_chart.draw(measured, out / "load.svg")
+    print(f"wrote {out / 'plan.json'}")
+    return "\n".join(harness.shortfalls(rows, FLOORS)) or None
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

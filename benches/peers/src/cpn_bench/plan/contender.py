@@ -1,0 +1,46 @@
+"""How a contender is asked to plan: numbers of batches come in on stdin, what they took goes out as lines of JSON."""
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cpn_bench.plan.model import PlanModel
+
+WARM_UP_BATCHES = 5
+Goals = TypeVar("Goals")
+
+
+class Contender(Protocol[Goals]):
+    """A planner that knows its goals."""
+
+    def embed(self, goals: NDArray[np.uint8]) -> Goals:
+        """Embeds goals `[B, 84, 84, 3]`, as the planner keeps them."""
+        ...
+
+    def plan(self, observations: NDArray[np.uint8], goals: Goals) -> NDArray[np.float32]:
+        """Plans from observations `[B, 84, 84, 3]` to embedded goals; actions `[B, H, A]`."""
+        ...
+
+
+def serve(contender: Contender[Goals], data: PlanModel, batch: int) -> None:
+    """Compiles and warms up, says so with the first plan, then plans as asked until stdin ends."""
+    starts = range(0, len(data.frames), batch)
+    batches: Sequence[tuple[NDArray[np.uint8], Goals]] = [
+        (data.frames[start : start + batch], contender.embed(data.goals[start : start + batch])) for start in starts
+    ]
+    first = contender.plan(*batches[0])[0]
+    for number in range(1, WARM_UP_BATCHES):
+        contender.plan(*batches[number % len(batches)])
+    print(json.dumps({"ready": True, "actions": first.tolist()}), flush=True)
+    number = WARM_UP_BATCHES
+    for line in sys.stdin:
+        start = time.perf_counter()
+        for _ in range(int(line)):
+            contender.plan(*batches[number % len(batches)])
+            number += 1
+        print(json.dumps({"seconds": time.perf_counter() - start}), flush=True)

@@ -1,0 +1,123 @@
+"""Our planning service and LitServe under load, each with its clients on the same cores."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from cpn_bench.harness import ENVIRONMENT, Row, module
+
+LITSERVE = "LitServe + PyTorch"
+COMPARED = ("zenoh tcp", "gRPC")
+"""Our transports that cross a network as HTTP does."""
+FEW, MANY = 1, 32
+"""Clients."""
+START_SECONDS, STOP_SECONDS = 120.0, 10.0
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What so many clients see, each asking anew as soon as it is answered."""
+
+    transport: str
+    clients: int
+    plans_per_second: float
+    p50_ms: float
+    """Of what a client waits for a plan."""
+    p99_ms: float
+    n: int
+    """Plans."""
+    server_ms_p50: float | None = None
+    """Of what the server says that a plan took it."""
+
+
+def ours(command: Sequence[str]) -> list[Measurement]:
+    """Has our bench measure our service over every transport."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "load.jsonl"
+        subprocess.run([*command, "--out", str(path)], check=True, stdout=sys.stderr)
+        return [Measurement(**json.loads(line)) for line in path.read_text().splitlines()]
+
+
+def litserve(model: Path, seconds: float) -> list[Measurement]:
+    """Measures LitServe with few clients and many, for so many seconds each."""
+    with _server(model) as address:
+        options = ["--url", f"{address}/predict", "--model", str(model), "--seconds", str(seconds)]
+
+        def load(clients: int) -> Measurement:
+            command = module("plan.load", *options, "--clients", str(clients))
+            loaded = subprocess.run(command, check=True, stdout=subprocess.PIPE)
+            return Measurement(LITSERVE, **json.loads(loaded.stdout))
+
+        return [load(clients) for clients in (FEW, MANY)]
+
+
+@contextmanager
+def _server(model: Path) -> Iterator[str]:
+    """The address of a LitServe that is ready."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = module("plan.litserve_server", "--model", str(model), "--port", str(port))
+    # A session of its own, so that its workers end with it.
+    process = subprocess.Popen(command, stdout=sys.stderr, env=os.environ | ENVIRONMENT, start_new_session=True)
+    try:
+        address = f"http://127.0.0.1:{port}"
+        _wait(process, f"{address}/health")
+        yield address
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        try:
+            process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _wait(process: "subprocess.Popen[bytes]", url: str) -> None:
+    """Waits until a server is healthy."""
+    end = time.monotonic() + START_SECONDS
+    while process.poll() is None and time.monotonic() < end:
+        try:
+            with urllib.request.urlopen(url, timeout=1):  # noqa: S310 - http
+                return
+        except (urllib.error.URLError, TimeoutError):
+            time.sleep(0.1)
+    raise RuntimeError(f"{LITSERVE}: expected it to be healthy within {START_SECONDS:.0f} s, got no answer from {url}")
+
+
+def tell(measured: Sequence[Measurement]) -> None:
+    """Prints what was measured."""
+    for m in measured:
+        server = "" if m.server_ms_p50 is None else f", {m.server_ms_p50:.2f} ms in the server"
+        print(
+            f"{m.transport:20s} {m.clients:3d} client{'s'[: m.clients > 1]:1s} {m.plans_per_second:8.0f} plans/s, "
+            f"p50 {m.p50_ms:.2f} ms, p99 {m.p99_ms:.2f} ms{server} (n = {m.n})",
+            flush=True,
+        )
+
+
+def rows(measured: Sequence[Measurement], command: str) -> list[Row]:
+    """Throughput with many clients and latency with one, beside LitServe's."""
+    of = {(m.transport, m.clients): m for m in measured}
+    found = []
+    for transport in COMPARED:
+        one, peer = of[transport, FEW], of[LITSERVE, FEW]
+        ratio = peer.p50_ms / one.p50_ms
+        name = f"{transport}, {FEW} client"
+        found.append(Row(name, one.p50_ms, peer.p50_ms, LITSERVE, ratio, "ms", one.n, command))
+        many, peer = of[transport, MANY], of[LITSERVE, MANY]
+        ratio = many.plans_per_second / peer.plans_per_second
+        name, rates = f"{transport}, {MANY} clients", (many.plans_per_second, peer.plans_per_second)
+        found.append(Row(name, *rates, LITSERVE, ratio, "plans/s", many.n, command))
+    return found
