@@ -6,10 +6,11 @@ UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXPORT := export/.venv
 BENCH := benches/train/.venv
+OPENPI := tests/openpi/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-export test-bench bench-sim bench-train lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench bench-sim bench-train lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -36,6 +37,10 @@ $(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
 
 $(BENCH)/.ready: benches/train/pyproject.toml benches/train/uv.lock | $(UV)
 	cd benches/train && $(UV) sync --quiet --locked
+	touch $@
+
+$(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock | $(UV)
+	cd tests/openpi && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -66,8 +71,15 @@ test-crash: setup ## Kill the recorder a hundred times
 test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
 	cargo test --workspace --locked --test swap -- --ignored --nocapture
 
+test-soak: setup ## Half an hour of everything at once against one planner: nothing fails, no memory grows
+	cargo test --workspace --locked --test soak -- --ignored --nocapture
+
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
+test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
+	cargo test --workspace --locked --test openpi
+	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-bench: $(BENCH)/.ready ## Check the mathematics of the training bench's peers, and its harness
 	cd benches/train && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
@@ -82,12 +94,12 @@ bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JA
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi
 
 clean: ## Remove what was built
-	rm -rf target $(WORKER) $(EXPORT) $(BENCH) .libtorch
+	rm -rf target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) .libtorch

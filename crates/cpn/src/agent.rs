@@ -1,34 +1,12 @@
-//! The compared methods behind one interface (section "Methods for comparison").
+//! A learned method of the comparison, to be trained (section "Methods for comparison").
 
-use crate::config::{Input, ModelConfig};
+use crate::config::ModelConfig;
 use crate::dynamics::PolicyDynamics;
 use crate::encoder::Encoder;
+use crate::inner_loop::{InnerLoop, TensorPlan};
 use crate::loss::{self, Batch};
-use crate::planner::{InnerLoop, Plan};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use std::sync::{Mutex, PoisonError};
-use tch::{Device, Kind, Tensor, nn};
-
-/// Anything that turns an observation and a goal into actions. Model predictive control applies the first action of each
-/// plan and plans anew.
-pub trait Method: Send {
-    /// Short name of the method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
-    fn name(&self) -> &'static str;
-
-    /// Number of actions in a plan.
-    fn horizon(&self) -> i64;
-
-    /// Whether observations and goals of this kind can be embedded.
-    fn takes(&self, input: Input) -> bool;
-
-    /// Embeds observations or goals, images `[B, 84, 84, 3]` or positions `[B, 3]`, as `[B, Z]`; Z is 0 for a method that
-    /// does not look.
-    fn encode(&self, input: &Tensor) -> Tensor;
-
-    /// Plans from x to x_g, both `[B, Z]`. `seed` drives whatever is random.
-    fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Plan;
-}
+use tch::{Device, Tensor, nn};
 
 /// A learned method: encoder, g_θ and the step size of its inner loop.
 #[derive(Debug)]
@@ -109,62 +87,23 @@ impl Agent {
     fn react(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         self.network.policy(&self.network.features(x, x_g)).unsqueeze(1)
     }
-}
 
-impl Method for Agent {
-    fn name(&self) -> &'static str {
-        self.config.method.name()
-    }
-
-    fn horizon(&self) -> i64 {
+    /// H, the number of actions in a plan.
+    pub fn horizon(&self) -> i64 {
         self.config.horizon
     }
 
-    fn takes(&self, input: Input) -> bool {
-        self.config.encoder.input() == input
-    }
-
-    fn encode(&self, input: &Tensor) -> Tensor {
+    /// Embeds observations or goals, images `[B, 84, 84, 3]` or positions `[B, 3]`, as `[B, Z]`.
+    pub fn encode(&self, input: &Tensor) -> Tensor {
         tch::no_grad(|| self.encoder.encode(input))
     }
 
-    fn plan(&self, x: &Tensor, x_g: &Tensor, _seed: u64) -> Plan {
+    /// Plans from x to x_g, both `[B, Z]`: the reference for [`crate::Planner`].
+    pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         if self.config.method.plans() {
             self.inner_loop().plan(x, x_g)
         } else {
-            Plan { actions: tch::no_grad(|| self.react(x, x_g)), inner_losses: Vec::new() }
+            TensorPlan { actions: tch::no_grad(|| self.react(x, x_g)), inner_losses: Vec::new() }
         }
-    }
-}
-
-/// The control of every comparison: uniform actions in [-1, 1], whatever the images show.
-#[derive(Debug)]
-pub struct Random {
-    /// A, the number of continuous actions.
-    pub actions: i64,
-}
-
-impl Method for Random {
-    fn name(&self) -> &'static str {
-        "random"
-    }
-
-    fn horizon(&self) -> i64 {
-        1
-    }
-
-    fn takes(&self, _input: Input) -> bool {
-        true
-    }
-
-    fn encode(&self, input: &Tensor) -> Tensor {
-        Tensor::zeros([input.size()[0], 0], (Kind::Float, Device::Cpu))
-    }
-
-    fn plan(&self, x: &Tensor, _x_g: &Tensor, seed: u64) -> Plan {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let shape = [x.size()[0], 1, self.actions];
-        let values: Vec<f32> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..=1.0)).collect();
-        Plan { actions: Tensor::from_slice(&values).view(shape), inner_losses: Vec::new() }
     }
 }

@@ -3,8 +3,8 @@
 //! Visual goal-directed meta-learning with contextual planning networks (Rivera and Handelman, 2021) shows an agent one
 //! image of a finished task and plans towards it in a learned latent space. The files of this crate are the paper's
 //! ideas, one each: [`encoder`] (f_φ), [`neuromodulated`] (the layer with attenuated weights), [`dynamics`] (g_θ, the
-//! combined policy and dynamics), [`planner`] (the inner loop), [`loss`] (the outer loop); [`agent`] puts them together
-//! for each of the compared methods.
+//! combined policy and dynamics), [`inner_loop`], [`loss`] (the outer loop); [`agent`] puts them together for each of the
+//! compared methods. [`fused`] does the same fast: [`Planner`] serves an agent's plans, as a [`method`].
 //!
 //! | symbol | name here | meaning |
 //! |---|---|---|
@@ -28,13 +28,15 @@ pub mod dynamics;
 pub mod encoder;
 pub mod fused;
 pub mod images;
+pub mod inner_loop;
 pub mod loss;
+pub mod method;
 pub mod neuromodulated;
-pub mod planner;
 pub mod positions;
 pub mod recipe;
 
-pub use agent::{Agent, Method, Random};
+pub use agent::Agent;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
-pub use planner::Plan;
+pub use fused::Planner;
+pub use method::{Method, Plan, Random};
 pub use recipe::{Preset, Recipe, Training};

@@ -1,11 +1,10 @@
 //! The outer loop: behaviour cloning of the planned actions, through the inner loop.
 
 use crate::agent::Agent;
-use crate::fused::{self, OuterLoop, Samples, Weights};
+use crate::fused::{self, OuterLoop, Samples, Variables, floats};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::time::Instant;
-use tch::kind::Element;
 use tch::{Kind, Tensor};
 
 /// The tensors of a training step.
@@ -103,16 +102,4 @@ impl OuterLoss {
             encoder_seconds: (encoding + started.elapsed()).as_secs_f64(),
         }
     }
-}
-
-struct Variables<'a>(&'a HashMap<String, Tensor>);
-
-impl<T: Element + Copy> Weights<T> for Variables<'_> {
-    fn get(&self, name: &str) -> Vec<T> {
-        floats(&self.0[name])
-    }
-}
-
-fn floats<T: Element + Copy>(tensor: &Tensor) -> Vec<T> {
-    Vec::try_from(tensor.flatten(0, -1)).expect("a tensor of the kind that was asked for")
 }

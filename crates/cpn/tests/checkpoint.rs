@@ -7,7 +7,7 @@ mod common;
 use common::{noise_images, position_config, small_config};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, Method, MethodKind, positions};
+use cpn::{Agent, MethodKind, positions};
 use serde_json::{Value, json};
 
 fn provenance() -> Provenance {
@@ -43,7 +43,7 @@ fn a_checkpoint_comes_back_whole() {
         assert_eq!(loaded.provenance, provenance());
         let x = agent.encode(input);
         assert_eq!(loaded.agent.encode(input), x);
-        assert_eq!(loaded.agent.plan(&x, &x, 0).actions, agent.plan(&x, &x, 0).actions);
+        assert_eq!(loaded.agent.plan(&x, &x).actions, agent.plan(&x, &x).actions);
         assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
         assert_eq!(loaded.parents(), ["d"]);

@@ -5,7 +5,7 @@
 mod common;
 
 use cpn::archive::{self, Tensors};
-use cpn::{Agent, Method, ModelConfig};
+use cpn::{Agent, ModelConfig};
 use tch::{Kind, Tensor};
 
 /// The agent with the reference's weights, in float64, and everything else the reference wrote.
@@ -31,7 +31,7 @@ fn check(method: &str) {
     assert_close("x", &x, &golden["x"]);
     assert_close("x_g", &x_g, &golden["x_g"]);
 
-    let plan = agent.plan(&x, &x_g, 0);
+    let plan = agent.plan(&x, &x_g);
     assert_close("actions", &plan.actions, &golden["actions"]);
     assert_close("inner_losses", &Tensor::stack(&plan.inner_losses, 0), &golden["inner_losses"]);
 

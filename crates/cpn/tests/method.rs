@@ -5,10 +5,10 @@
 mod common;
 
 use common::{double_agent, noise_images, paired, position_config, small_config, uniform};
+use cpn::inner_loop::InnerLoop;
 use cpn::loss::Batch;
 use cpn::neuromodulated::Neuromodulated;
-use cpn::planner::InnerLoop;
-use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Random, positions};
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, positions};
 use tch::nn::{self, Module};
 use tch::{Device, Kind, Tensor};
 
@@ -81,9 +81,9 @@ fn a_plan_does_not_depend_on_its_batch() {
     for method in MethodKind::ALL {
         let agent = double_agent(small_config(method));
         let (x, x_g) = (uniform(&[7, 6], 1), uniform(&[7, 6], 2));
-        let together = agent.plan(&x, &x_g, 0);
+        let together = agent.plan(&x, &x_g);
         for row in 0..7 {
-            let alone = agent.plan(&x.narrow(0, row, 1), &x_g.narrow(0, row, 1), 0);
+            let alone = agent.plan(&x.narrow(0, row, 1), &x_g.narrow(0, row, 1));
             assert!(max_difference(&alone.actions, &together.actions.narrow(0, row, 1)) < 1e-12, "{method}");
             for (a, b) in alone.inner_losses.iter().zip(&together.inner_losses) {
                 assert!(max_difference(a, &b.narrow(0, row, 1)) < 1e-12, "{method}");
@@ -153,10 +153,10 @@ fn each_method_sees_what_it_should() {
     for method in MethodKind::ALL {
         let agent = double_agent(small_config(method));
         let [x, goal_a, goal_b] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
-        let change = max_difference(&agent.plan(&x, &goal_a, 0).actions, &agent.plan(&x, &goal_b, 0).actions);
+        let change = max_difference(&agent.plan(&x, &goal_a).actions, &agent.plan(&x, &goal_b).actions);
         assert_eq!(change > 0.0, method != MethodKind::Bc, "{method}: only BC ignores the goal");
-        let moved = agent.plan(&(&x + 0.1), &goal_a, 0).actions;
-        assert!(max_difference(&moved, &agent.plan(&x, &goal_a, 0).actions) > 0.0, "{method}");
+        let moved = agent.plan(&(&x + 0.1), &goal_a).actions;
+        assert!(max_difference(&moved, &agent.plan(&x, &goal_a).actions) > 0.0, "{method}");
     }
 }
 
@@ -169,16 +169,6 @@ fn steps_past_the_demonstration_do_not_count() {
     let before = loss();
     let _ = batch.actions.get(1).narrow(0, 2, 3).fill_(9.0);
     assert!((loss() - before).abs() < 1e-12);
-}
-
-#[test]
-fn random_actions_follow_the_seed() {
-    let random = Random { actions: 4 };
-    let x = random.encode(&noise_images(1, 0));
-    let plan = |seed| random.plan(&x, &x, seed).actions;
-    assert_eq!(plan(1), plan(1));
-    assert_ne!(plan(1), plan(2));
-    assert!(plan(1).abs().max().double_value(&[]) <= 1.0);
 }
 
 /// The same place, told from two origins and in two units, is the same to the encoder.
@@ -207,7 +197,7 @@ fn every_preset_builds() {
             };
             let x = agent.encode(&inputs);
             assert_eq!(x.size(), [2, encoder.latent()]);
-            assert_eq!(agent.plan(&x, &x, 0).actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
+            assert_eq!(agent.plan(&x, &x).actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
         }
     }
 }

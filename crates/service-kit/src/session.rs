@@ -17,6 +17,10 @@ pub struct SessionConfig {
     #[arg(long, env = "CPN_LISTEN", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
+    /// Passes large payloads to processes on the same machine by shared memory.
+    #[arg(long, env = "CPN_SHARED_MEMORY")]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub shared_memory: bool,
     /// Key prefix that keeps this run's messages apart from those of others.
     #[arg(long, env = "CPN_NAMESPACE")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -41,6 +45,7 @@ pub async fn open(config: &SessionConfig) -> anyhow::Result<zenoh::Session> {
     set("connect/exit_on_failure", json!(false))?;
     let any_port = ["tcp/127.0.0.1:0".to_owned()];
     set("listen/endpoints", json!(if config.listen.is_empty() { &any_port[..] } else { &config.listen[..] }))?;
+    set("transport/shared_memory/enabled", json!(config.shared_memory))?;
     if let Some(namespace) = &config.namespace {
         set("namespace", json!(namespace))?;
     }

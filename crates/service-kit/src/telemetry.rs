@@ -1,10 +1,56 @@
-//! Logs.
+//! Logs and traces.
 
+use anyhow::Context;
+use opentelemetry::global;
+use opentelemetry::trace::TracerProvider;
+use opentelemetry_otlp::SpanExporter;
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::propagation::TraceContextPropagator;
+use opentelemetry_sdk::trace::SdkTracerProvider;
+use std::env;
 use std::io::{IsTerminal, stderr};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
-/// Logs to standard error, at `info` unless `RUST_LOG` says otherwise.
-pub fn init() {
+/// Where spans are sent to, as OpenTelemetry names it; nothing is traced without.
+const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
+/// Whose spans are traced.
+const TRACED: [&str; 3] = ["planner", "evaluator", "wire"];
+
+/// Sends what is left when it is dropped.
+#[derive(Debug)]
+pub struct Telemetry(Option<SdkTracerProvider>);
+
+/// Logs to standard error, at `info` unless `RUST_LOG` says otherwise. If `OTEL_EXPORTER_OTLP_ENDPOINT` is set, sends spans
+/// there by gRPC, in the name of `service`.
+///
+/// # Errors
+/// If the endpoint is malformed.
+pub fn init(service: &'static str) -> anyhow::Result<Telemetry> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr).with_ansi(stderr().is_terminal()).init();
+    let logs = tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal());
+    let provider = env::var_os(ENDPOINT).map(|_| provider(service)).transpose()?;
+    let traces = provider.as_ref().map(|provider| {
+        global::set_text_map_propagator(TraceContextPropagator::new());
+        let targets = TRACED.map(|target| (target, tracing_subscriber::filter::LevelFilter::DEBUG));
+        tracing_opentelemetry::layer().with_tracer(provider.tracer(service)).with_filter(Targets::from_iter(targets))
+    });
+    tracing_subscriber::registry().with(logs.with_filter(filter)).with(traces).init();
+    Ok(Telemetry(provider))
+}
+
+fn provider(service: &'static str) -> anyhow::Result<SdkTracerProvider> {
+    let exporter = SpanExporter::builder().with_tonic().build().context(ENDPOINT)?;
+    let resource = Resource::builder().with_service_name(service).build();
+    Ok(SdkTracerProvider::builder().with_batch_exporter(exporter).with_resource(resource).build())
+}
+
+impl Drop for Telemetry {
+    fn drop(&mut self) {
+        if let Some(Err(error)) = self.0.take().map(|provider| provider.shutdown()) {
+            tracing::warn!(%error, "spans not sent");
+        }
+    }
 }

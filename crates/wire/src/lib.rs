@@ -16,6 +16,7 @@ pub mod query;
 pub mod replay;
 mod search;
 pub mod sim;
+pub mod trace;
 pub mod training;
 
 pub use error::{Code, Error};

@@ -150,6 +150,22 @@ fn actions(field: &str, actions: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Er
     actions.into_iter().map(action).collect::<Result<_, _>>().map_err(|e| e.within(field))
 }
 
+impl PlanRequest {
+    /// Asks for a plan by the model's own search, seed 0, whenever it comes.
+    pub fn new(model: impl Into<String>, goal: Goal, observation: Observation) -> Self {
+        Self {
+            model: model.into(),
+            goal,
+            observation,
+            seed: 0,
+            deadline: None,
+            model_digest: None,
+            search: None,
+            warm_start: Vec::new(),
+        }
+    }
+}
+
 impl Message for PlanRequest {
     type Proto = proto::PlanRequest;
 }

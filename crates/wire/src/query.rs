@@ -1,8 +1,9 @@
 //! Request and reply over zenoh queries, typed on both sides.
 
-use crate::{Code, Error, Message, decode, encode, proto};
+use crate::{Code, Error, Message, decode, encode, proto, trace};
 use prost::{Message as _, Name};
 use std::time::Duration;
+use tracing::{Instrument, debug_span};
 use zenoh::bytes::Encoding;
 use zenoh::key_expr::{OwnedKeyExpr, keyexpr};
 use zenoh::query::{ConsolidationMode, Query, Reply};
@@ -25,19 +26,23 @@ pub async fn call<Q: Message, R: Message>(
     timeout: Duration,
 ) -> Result<R, Error> {
     let unavailable = |e: zenoh::Error| Error::new(Code::Unavailable, key.as_str(), "an answer", e);
-    let replies = session
-        .get(key)
-        .payload(encode(request))
-        .encoding(encoding::<Q::Proto>())
-        .consolidation(ConsolidationMode::None)
-        .timeout(timeout)
-        .await
-        .map_err(unavailable)?;
-    // Right after a reconnect a query can end at once without any reply.
-    let Ok(reply) = replies.recv_async().await else {
-        return Err(Error::new(Code::Unavailable, key.as_str(), "a service", "none connected"));
+    let ask = async {
+        let replies = session
+            .get(key)
+            .payload(encode(request))
+            .encoding(encoding::<Q::Proto>())
+            .attachment(trace::traceparent())
+            .consolidation(ConsolidationMode::None)
+            .timeout(timeout)
+            .await
+            .map_err(unavailable)?;
+        // Right after a reconnect a query can end at once without any reply.
+        let Ok(reply) = replies.recv_async().await else {
+            return Err(Error::new(Code::Unavailable, key.as_str(), "a service", "none connected"));
+        };
+        decode_reply(reply, key, timeout)
     };
-    decode_reply(reply, key, timeout)
+    ask.instrument(debug_span!("query", otel.kind = "client", %key)).await
 }
 
 /// Asks, without a payload, for everything at a key, and awaits every answer, in the order they come; several services
@@ -90,6 +95,11 @@ fn decode_reply<R: Message>(reply: Reply, key: &OwnedKeyExpr, timeout: Duration)
 pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
     let payload = query.payload().ok_or_else(|| Error::missing("payload"))?;
     decode(&payload.to_bytes())
+}
+
+/// The span that sent a query, if it says so.
+pub fn traceparent(query: &Query) -> Option<String> {
+    query.attachment().and_then(|attachment| attachment.try_to_string().ok().map(Into::into))
 }
 
 /// Answers a query, with the value or the error.

@@ -53,8 +53,8 @@ impl TryFrom<proto::Search> for Search {
         if samples == Some(1) {
             return Err(Error::invalid("samples", format!("2 to {MAX_SAMPLES}, or 0"), 1));
         }
-        let iterations = at_most("iterations", MAX_ITERATIONS, search.iterations)?;
-        Ok(Self { solver, iterations, samples, anytime: search.anytime })
+        at_most("iterations", MAX_ITERATIONS, search.iterations.unwrap_or_default())?;
+        Ok(Self { solver, iterations: search.iterations, samples, anytime: search.anytime })
     }
 }
 
@@ -68,7 +68,7 @@ impl From<Search> for proto::Search {
         };
         Self {
             solver: solver.into(),
-            iterations: search.iterations.unwrap_or_default(),
+            iterations: search.iterations,
             samples: search.samples.unwrap_or_default(),
             anytime: search.anytime,
         }

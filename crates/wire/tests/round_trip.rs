@@ -43,7 +43,7 @@ fn point() -> impl Strategy<Value = Position> {
 
 fn search() -> impl Strategy<Value = Search> {
     let solver = prop_oneof![Just(Solver::Gradient), Just(Solver::Cem), Just(Solver::Mppi), Just(Solver::Hybrid)];
-    (solver, option::of(1u32..=1000), option::of(2u32..=4096), any::<bool>()).prop_map(
+    (solver, option::of(0u32..=1000), option::of(2u32..=4096), any::<bool>()).prop_map(
         |(solver, iterations, samples, anytime)| Search {
             solver,
             iterations,

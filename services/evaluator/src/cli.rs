@@ -18,7 +18,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Run every model on every variation of every task, then report; trials that the folder already holds are kept.
-    Run(RunArgs),
+    Run(Box<RunArgs>),
     /// Report again from the records of a run.
     Report(ReportArgs),
     /// Ask a planner again for every plan of a recorded episode, and compare the answers bit for bit.

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
-    service_kit::telemetry::init();
+    let _telemetry = service_kit::telemetry::init("cpn-eval")?;
     match Cli::parse().command {
         Command::Run(args) => tell(&evaluator::run(&args).await?, args.json),
         Command::Report(args) => tell(&evaluator::report(&args.out)?, args.json),

@@ -62,9 +62,9 @@ pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     let exchanges = recorded.exchanges();
     let mut difference = None;
     for (step, exchange) in exchanges.iter().enumerate() {
-        let (request, expected) = again(&recorded.episode().goal, exchange);
+        let request = again(&recorded.episode().goal, exchange);
         let now = crate::ask(&session, &key, request, PATIENCE).await.with_context(|| format!("step {step}"))?;
-        difference = compare(step, &expected, &now);
+        difference = compare(step, exchange, now);
         if difference.is_some() {
             break;
         }
@@ -75,30 +75,35 @@ pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     Ok(Replay { plans: exchanges.len(), difference })
 }
 
-/// The request that brings a plan again, whatever the planner remembers and however long it takes, and the answer it must
-/// get.
-fn again(goal: &Observation, exchange: &Exchange) -> (PlanRequest, PlanResponse) {
-    let Exchange { mut request, mut response, .. } = exchange.clone();
+/// The request that brings a plan again, whatever the planner remembers and however long it takes.
+fn again(goal: &Observation, Exchange { request, response, .. }: &Exchange) -> PlanRequest {
+    let mut request = request.clone();
     request.goal = match goal {
         Observation::Image(image) => Goal::Image(image.clone()),
         Observation::Position(position) => Goal::Position(*position),
     };
     request.deadline = None;
     request.model_digest = Some(response.model_digest.clone());
-    if let Some(search) = request.search.filter(|search| search.anytime) {
-        // As many iterations as the plan was found after; at least one, since 0 stands for the model's own number. Those
-        // that were run afterwards found nothing better.
-        let iterations = response.iterations.max(1);
-        request.search = Some(Search { iterations: Some(iterations), anytime: false, ..search });
-        response.inner_losses.truncate(iterations as usize + 1);
+    if let Some(search) = request.search.as_mut().filter(|search| search.anytime) {
+        *search = Search { iterations: Some(response.iterations), anytime: false, ..*search };
     }
-    (request, response)
+    request
 }
 
 /// The first value of a plan that is not as recorded.
-fn compare(step: usize, recorded: &PlanResponse, now: &PlanResponse) -> Option<Difference> {
+fn compare(step: usize, Exchange { request, response, .. }: &Exchange, mut now: PlanResponse) -> Option<Difference> {
+    let mut recorded = response.clone();
+    if request.search.is_some_and(|search| search.anytime) {
+        // The recorded losses are of the best plan so far, and go on with iterations that found nothing better.
+        recorded.inner_losses.truncate(recorded.iterations as usize + 1);
+        let mut best = f32::INFINITY;
+        for loss in &mut now.inner_losses {
+            best = if *loss < best { *loss } else { best };
+            *loss = best;
+        }
+    }
     let difference = |value, recorded, now| Some(Difference { step, value, recorded, now });
-    let (before, after) = (values(recorded), values(now));
+    let (before, after) = (values(&recorded), values(&now));
     let longer = if before.len() > after.len() { &before } else { &after };
     for (index, (name, _)) in longer.iter().enumerate() {
         let of = |values: &[(String, &[f32])]| values.get(index).map_or(Vec::new(), |(_, values)| values.to_vec());
@@ -150,7 +155,7 @@ mod tests {
         let response = PlanResponse {
             actions: vec![vec![0.5, -2.0, 0.0]; 2],
             first_action: vec![0.5, -1.0, 0.0],
-            inner_losses: vec![3.0, 2.0, 1.0, 1.0, 1.0],
+            inner_losses: vec![3.0, 3.0, 1.0, 1.0, 1.0],
             latent_distance: Some(4.0),
             times: StageTimes::default(),
             model_digest: "0".repeat(64),
@@ -164,26 +169,30 @@ mod tests {
 
     #[test]
     fn a_search_until_the_deadline_is_repeated_by_its_iterations() {
-        let anytime = Search { solver: Solver::Cem, iterations: None, samples: Some(8), anytime: true };
+        let anytime = Search { solver: Solver::Gradient, iterations: None, samples: None, anytime: true };
         let goal = Position::new([0.0; 3]).unwrap().into();
-        let (request, expected) = again(&goal, &exchange(Some(anytime)));
+        let recorded = exchange(Some(anytime));
+        let request = again(&goal, &recorded);
         assert_eq!(request.search, Some(Search { iterations: Some(2), anytime: false, ..anytime }));
         assert_eq!((request.deadline, request.model_digest), (None, Some("0".repeat(64))));
-        assert_eq!(expected.inner_losses, [3.0, 2.0, 1.0]);
-
-        let fixed = Search { iterations: Some(4), anytime: false, ..anytime };
-        let (request, expected) = again(&goal, &exchange(Some(fixed)));
-        assert_eq!((request.search, expected.inner_losses.len()), (Some(fixed), 5));
         assert_eq!((request.seed, request.warm_start), (7, vec![vec![0.5; 3]; 2]));
+        // A fixed number of updates answers the last plan, and tells the losses of all.
+        let now = |losses: [f32; 3]| PlanResponse { inner_losses: losses.into(), ..recorded.response.clone() };
+        assert_eq!(compare(0, &recorded, now([3.0, 5.0, 1.0])), None);
+        assert_eq!(compare(0, &recorded, now([3.0, 5.0, 2.0])).unwrap().value, "inner_losses[2]");
+
+        let fixed = exchange(Some(Search { iterations: Some(4), anytime: false, ..anytime }));
+        assert_eq!(again(&goal, &fixed).search, fixed.request.search);
+        assert_eq!(compare(0, &fixed, now([3.0, 3.0, 1.0])).unwrap().value, "inner_losses");
     }
 
     #[test]
     fn each_value_is_compared_by_its_bits() {
-        let recorded = exchange(None).response;
+        let recorded = exchange(None);
         let difference = |spoil: fn(&mut PlanResponse)| {
-            let mut now = recorded.clone();
+            let mut now = recorded.response.clone();
             spoil(&mut now);
-            compare(3, &recorded, &now).map(|found| Replay { plans: 9, difference: Some(found) }.to_string())
+            compare(3, &recorded, now).map(|found| Replay { plans: 9, difference: Some(found) }.to_string())
         };
         let cases: [(fn(&mut PlanResponse), &str); 9] = [
             (|now| now.actions[1][2] = -0.0, "actions[1][2]: recorded 0, now -0"),

@@ -80,15 +80,15 @@ pub(crate) async fn attempt(
     let mut frames = vec![reset.observation];
     for step in 0..reset.max_steps {
         let request = PlanRequest {
-            model: model.name.clone(),
-            goal: goal.clone(),
-            observation: hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
             // The one that the run began with, though the planner may swap.
             model_digest: Some(model.digest.clone()),
-            search: None,
-            warm_start: Vec::new(),
+            ..PlanRequest::new(
+                &model.name,
+                goal.clone(),
+                hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
+            )
         };
         let asked = start.elapsed();
         let mut plan = link.plan(request.clone()).await;

@@ -4,10 +4,12 @@
 
 mod common;
 
-use common::Lab;
+use common::{LIMIT, Lab};
 use recording::plans::{self, Plans};
 use service_kit::SessionConfig;
 use std::path::PathBuf;
+use std::time::Duration;
+use wire::planner::{Search, Solver};
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse};
 use wire::{Image, Position, key, query};
 use zenoh::Session;
@@ -88,6 +90,30 @@ async fn an_episode_comes_back_bit_for_bit() {
             lab.stop_planner().await;
         }
     }
+}
+
+/// However many iterations the deadline left time for.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_search_until_its_deadline_comes_back() {
+    let (mut lab, file) = recorded("reach", "cpn").await;
+    let plans = plans::read(&file).unwrap();
+    let mut exchanges = plans.exchanges().to_vec();
+    let session = worker(&lab).await;
+    let planners =
+        session.liveliness().declare_subscriber(key::planner_alive("*").unwrap()).history(true).await.unwrap();
+    planners.recv_async().await.unwrap();
+    for (exchange, solver) in exchanges.iter_mut().zip([Solver::Gradient, Solver::Cem, Solver::Mppi, Solver::Hybrid]) {
+        let samples = (solver != Solver::Gradient).then_some(8);
+        exchange.request.search = Some(Search { solver, iterations: None, samples, anytime: true });
+        exchange.request.deadline = Some(Duration::from_millis(200));
+        let plan = key::planner_plan("planner").unwrap();
+        exchange.response = query::call(&session, &plan, exchange.request.clone(), LIMIT).await.unwrap();
+    }
+    let searched = Plans::new(plans.episode().clone(), exchanges).unwrap();
+    std::fs::write(&file, plans::to_bytes(&searched).unwrap()).unwrap();
+    let ended = lab.replay(&file).await;
+    assert_eq!((ended.success, ended.stdout.as_str()), (true, "4 plans: bit for bit the same\n"));
+    lab.stop_planner().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

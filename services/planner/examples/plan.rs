@@ -21,17 +21,7 @@ async fn main() -> anyhow::Result<()> {
     let endpoint = arguments.next().unwrap_or_else(|| "tcp/127.0.0.1:7447".into());
 
     let session = service_kit::session::open(&SessionConfig { connect: vec![endpoint], ..Default::default() }).await?;
-    let (model, goal, observation) = ("cpn".into(), Goal::Image(goal), observation.into());
-    let request = PlanRequest {
-        model,
-        goal,
-        observation,
-        seed: 0,
-        deadline: None,
-        model_digest: None,
-        search: None,
-        warm_start: Vec::new(),
-    };
+    let request = PlanRequest::new("cpn", Goal::Image(goal), observation.into());
     let key = key::planner_plan("planner")?;
     let plan: PlanResponse = query::call(&session, &key, request, Duration::from_secs(10)).await?;
     println!("apply {:?} of {} planned actions", plan.first_action, plan.actions.len());

@@ -16,6 +16,8 @@ pub struct Config {
     pub models_dir: PathBuf,
     /// Where gRPC listens; port 0 takes a free one.
     pub grpc_listen: SocketAddr,
+    /// Where clients of openpi are listened to; nowhere if none.
+    pub openpi_listen: Option<SocketAddr>,
     /// Most plan requests that wait for the model; one more is refused.
     pub queue_capacity: NonZeroU16,
     /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
@@ -23,8 +25,14 @@ pub struct Config {
     /// Most checkpoints of a model that are kept after they were swapped out, for episodes that began with them; the least
     /// recently used go first.
     pub retired_capacity: NonZeroU16,
-    /// Threads libtorch uses for one plan.
+    /// Most plans that are made together.
+    pub batch_size: NonZeroU16,
+    /// How long a plan waits for company, in milliseconds.
+    pub batch_delay_ms: u16,
+    /// Threads that plans which are made together are spread over.
     pub threads: NonZeroU16,
+    /// Where Prometheus finds metrics; none are served if it is not given.
+    pub metrics_listen: Option<SocketAddr>,
     /// How the planner joins the others over zenoh.
     pub session: SessionConfig,
 }
@@ -38,10 +46,14 @@ impl Default for Config {
             name: "planner".into(),
             models_dir: "models".into(),
             grpc_listen: (Ipv4Addr::LOCALHOST, 50051).into(),
+            openpi_listen: None,
             queue_capacity: count(64),
             goal_capacity: count(1024),
             retired_capacity: count(3),
+            batch_size: count(64),
+            batch_delay_ms: 0,
             threads: count(1),
+            metrics_listen: None,
             session: SessionConfig::default(),
         }
     }
@@ -70,6 +82,10 @@ pub struct Args {
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub grpc_listen: Option<SocketAddr>,
+    /// Where clients of openpi are listened to [default: nowhere].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub openpi_listen: Option<SocketAddr>,
     /// Most plan requests that wait for the model [default: 64].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -82,10 +98,22 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub retired_capacity: Option<NonZeroU16>,
-    /// Threads libtorch uses for one plan [default: 1].
+    /// Most plans that are made together [default: 64].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch_size: Option<NonZeroU16>,
+    /// How long a plan waits for company, in milliseconds [default: 0].
+    #[arg(long, value_name = "MS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch_delay_ms: Option<u16>,
+    /// Threads that plans which are made together are spread over [default: 1].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<NonZeroU16>,
+    /// Where Prometheus finds metrics, for example 127.0.0.1:9465 [default: nowhere].
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub metrics_listen: Option<SocketAddr>,
     /// How to join the others.
     #[command(flatten)]
     pub session: SessionConfig,

@@ -3,13 +3,15 @@
 use crate::config::Config;
 use crate::goals::Goals;
 use crate::model::{Model, RANDOM};
-use crate::model_thread::{ModelThread, PlanTask};
+use crate::model_thread::ModelThread;
 use crate::served::unknown_model;
+use crate::task::PlanTask;
 use anyhow::Context;
+use std::num::NonZeroU16;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
-use tracing::{info, warn};
+use tracing::{Span, info, warn};
 use wire::checkpoint::CheckpointManifest;
 use wire::planner::{
     CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
@@ -29,6 +31,7 @@ pub struct PlannerCore {
     goals: Arc<Goals>,
     loads: Arc<Semaphore>,
     models_dir: Arc<Path>,
+    threads: NonZeroU16,
 }
 
 impl PlannerCore {
@@ -37,8 +40,8 @@ impl PlannerCore {
     /// # Errors
     /// Names the first checkpoint that cannot be loaded, and why.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
-        let folder = config.models_dir.clone();
-        let models = tokio::task::spawn_blocking(move || load_all(&folder)).await??;
+        let (folder, threads) = (config.models_dir.clone(), config.threads);
+        let models = tokio::task::spawn_blocking(move || load_all(&folder, threads)).await??;
         for Model { info, .. } in &models {
             info!(model = info.name, method = info.method, digest = info.digest, "serving");
         }
@@ -47,6 +50,7 @@ impl PlannerCore {
             goals: Arc::new(Goals::new(config.goal_capacity)),
             loads: Arc::new(Semaphore::new(MAX_LOADS)),
             models_dir: config.models_dir.clone().into(),
+            threads,
         })
     }
 
@@ -57,10 +61,10 @@ impl PlannerCore {
     /// for an unknown model or goal id;
     /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently, or the checkpoint
     /// that must answer is not kept;
-    /// `RESOURCE_EXHAUSTED` if the queue is full; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
+    /// `RESOURCE_EXHAUSTED` if the queue is full, or so long that the deadline would pass; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline, model_digest, .. } = request;
+        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start } = request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
         }
@@ -78,7 +82,19 @@ impl PlannerCore {
             }
             Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
-        let task = PlanTask { model, model_digest, goal_id, goal, goal_field, observation, seed, deadline };
+        let task = PlanTask {
+            model,
+            model_digest,
+            goal_id,
+            goal,
+            goal_field,
+            observation,
+            seed,
+            deadline,
+            search,
+            warm_start,
+            span: Span::current(),
+        };
         self.thread.plan(task).await
     }
 
@@ -103,8 +119,8 @@ impl PlannerCore {
         let _load = self.loads.try_acquire().map_err(|_| {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
-        let folder = Arc::clone(&self.models_dir);
-        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request)).await? })
+        let (folder, threads) = (Arc::clone(&self.models_dir), self.threads);
+        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request, threads)).await? })
     }
 
     /// The same with a published checkpoint, whose bytes must be what its manifest says.
@@ -116,7 +132,8 @@ impl PlannerCore {
         check_replaceable(&manifest.model)?;
         // It comes once and unasked, so that it waits where a client would be sent away.
         let _load = self.loads.acquire().await;
-        self.swap_in(move || Model::published(manifest, &bytes)).await.map(drop)
+        let threads = self.threads;
+        self.swap_in(move || Model::published(manifest, &bytes, threads)).await.map(drop)
     }
 
     async fn swap_in(&self, load: impl FnOnce() -> Result<Model, Error> + Send + 'static) -> Result<ModelInfo, Error> {
@@ -149,10 +166,10 @@ impl PlannerCore {
 }
 
 /// `random` and every checkpoint in `folder`.
-fn load_all(folder: &Path) -> anyhow::Result<Vec<Model>> {
+fn load_all(folder: &Path, threads: NonZeroU16) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
     for path in checkpoints(folder).with_context(|| format!("model folder {}", folder.display()))? {
-        models.push(load_file(folder, &path).with_context(|| format!("checkpoint {}", path.display()))?);
+        models.push(load_file(folder, &path, threads).with_context(|| format!("checkpoint {}", path.display()))?);
     }
     if models.len() == 1 {
         warn!(folder = %folder.display(), "no checkpoints: only the random model is served");
@@ -172,14 +189,14 @@ fn checkpoints(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-fn load_file(folder: &Path, path: &Path) -> Result<Model, Error> {
+fn load_file(folder: &Path, path: &Path, threads: NonZeroU16) -> Result<Model, Error> {
     let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let source = CheckpointSource::File(text(path.file_name()));
     let request = LoadModelRequest { model: text(path.file_stem()), source };
     // A file's name is as free as a stranger's message: the trip through the wire applies the same rules to it.
     let request: LoadModelRequest = wire::decode(&wire::encode(request))?;
     check_replaceable(&request.model)?;
-    Model::load(folder, request)
+    Model::load(folder, request, threads)
 }
 
 fn check_replaceable(name: &str) -> Result<(), Error> {

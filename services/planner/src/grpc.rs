@@ -8,10 +8,12 @@ use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status};
 use tower::util::MapResponseLayer;
+use tracing::{Instrument, debug_span};
 use wire::grpc::{answer, name_unreadable_payload};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::proto::planner_service_server::{PlannerService, PlannerServiceServer};
-use wire::{Message, proto};
+use wire::trace::TRACEPARENT;
+use wire::{Message, proto, trace};
 
 /// The one method whose requests are large has a limit of its own.
 const LOAD_MODEL_PATH: &str = "/cpn.v1.PlannerService/LoadModel";
@@ -36,7 +38,10 @@ struct Grpc(PlannerCore);
 #[tonic::async_trait]
 impl PlannerService for Grpc {
     async fn plan(&self, request: Request<proto::PlanRequest>) -> Result<Response<proto::PlanResponse>, Status> {
-        answer(request, |request| self.0.plan(request)).await
+        let span = debug_span!("request", otel.kind = "server", key = "PlannerService/Plan");
+        let parent = request.metadata().get(TRACEPARENT).and_then(|value| value.to_str().ok());
+        trace::follow(&span, parent);
+        answer(request, |request| self.0.plan(request)).instrument(span).await
     }
 
     async fn register_goal(

@@ -7,7 +7,7 @@ use service_kit::{config, shutdown, telemetry};
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let args = Args::parse();
-    telemetry::init();
+    let _telemetry = telemetry::init("cpn-planner")?;
     let config: Config = config::load("CPN_PLANNER_", args.config.as_deref(), &args)?;
     let planner = planner::start(config).await?;
     shutdown::requested().await?;

@@ -1,20 +1,26 @@
 //! A model as it is served, and what is checked before it is.
 
+use crate::task::PlanTask;
 use cpn::checkpoint::{self, Checkpoint, Provenance};
-use cpn::{Input, Method, Random, images, positions};
+use cpn::method::{self, Iterations, Observed, Query};
+use cpn::{Input, Method, Plan, Planner, Random, images};
 use service_kit::files;
 use std::fmt;
 use std::io;
+use std::num::NonZeroU16;
 use std::path::Path;
-use tch::{Kind, Tensor};
 use wire::checkpoint::CheckpointManifest;
-use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo};
+use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo, Search, Solver};
 use wire::{Code, Error, Observation};
 
 /// Name of the control of every comparison, always served.
 pub const RANDOM: &str = "random";
 /// A of the control: hand displacement x, y, z and gripper effort.
-const RANDOM_ACTIONS: i64 = 4;
+const RANDOM_ACTIONS: usize = 4;
+/// Plans in a generation, if a request does not say.
+const SAMPLES: u32 = 64;
+/// Generations, likewise.
+const GENERATIONS: u32 = 4;
 
 /// A method with the name and digest it is served under.
 pub struct Model {
@@ -26,13 +32,10 @@ pub struct Model {
     pub method: Box<dyn Method>,
 }
 
-/// The numbers of one plan, all finite.
+/// A plan, whose numbers are all finite.
 #[derive(Debug)]
 pub(crate) struct Planned {
-    /// `[H][A]`, not clipped.
-    pub(crate) actions: Vec<Vec<f32>>,
-    /// One before each update and one after the last.
-    pub(crate) inner_losses: Vec<f32>,
+    pub(crate) plan: Plan,
     /// Euclidean; none if Z is 0.
     pub(crate) latent_distance: Option<f32>,
 }
@@ -53,7 +56,7 @@ impl Model {
     ///
     /// # Errors
     /// If the file is not there, or for anything wrong with the checkpoint, with the reason in `got`.
-    pub(crate) fn load(folder: &Path, request: LoadModelRequest) -> Result<Self, Error> {
+    pub(crate) fn load(folder: &Path, request: LoadModelRequest, threads: NonZeroU16) -> Result<Self, Error> {
         let bytes = match request.source {
             CheckpointSource::Bytes(bytes) => bytes,
             // One byte more than a checkpoint may have, so that it is refused as too large.
@@ -63,14 +66,14 @@ impl Model {
                     _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
                 })?,
         };
-        Self::tried(request.model, 0, read(&bytes)?)
+        Self::tried(request.model, 0, read(&bytes)?, threads)
     }
 
     /// Reads a published checkpoint, if the bytes are what its manifest says, and tries it once. Blocks.
     ///
     /// # Errors
     /// If they are not, with the manifest's field, or for anything wrong with the checkpoint.
-    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8]) -> Result<Self, Error> {
+    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], threads: NonZeroU16) -> Result<Self, Error> {
         let CheckpointManifest { model, version, digest, config_digest, .. } = manifest;
         let got = checkpoint::digest(bytes);
         if got != digest {
@@ -80,34 +83,63 @@ impl Model {
         if loaded.config_digest != config_digest {
             return Err(Error::invalid("config_digest", config_digest, loaded.config_digest));
         }
-        Self::tried(model, version, loaded)
+        Self::tried(model, version, loaded, threads)
     }
 
     /// What a checkpoint holds, once it has planned.
-    fn tried(name: String, version: u32, loaded: Checkpoint) -> Result<Self, Error> {
+    fn tried(name: String, version: u32, loaded: Checkpoint, threads: NonZeroU16) -> Result<Self, Error> {
         let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
-        let info = info(name, version, &loaded.agent, loaded.digest, training_tasks);
-        let model = Self { info, render_spec, method: Box::new(loaded.agent) };
+        let method: Box<dyn Method> = Box::new(Planner::new(&loaded.agent, usize::from(threads.get())));
+        let info = info(name, version, &*method, loaded.digest, training_tasks);
+        let mut model = Self { info, render_spec, method };
         model.warm_up()?;
         Ok(model)
     }
 
     /// Plans once, from black to white or from one corner of space to another: the first request does not pay for it, and
     /// weights that are finite but lead to plans that are not are found out.
-    fn warm_up(&self) -> Result<(), Error> {
-        let [x, x_g] = if self.method.takes(Input::Image) {
-            [0, u8::MAX].map(|level| self.encode_bytes(&vec![level; images::BYTES]))
+    fn warm_up(&mut self) -> Result<(), Error> {
+        let (black, white) = (vec![0; images::BYTES], vec![u8::MAX; images::BYTES]);
+        let ends = if self.method.takes(Input::Image) {
+            [&black, &white].map(|image| Observed::Image(image))
         } else {
-            [-1.0, 1.0].map(|metres| self.encode_metres([metres; 3]))
+            [-1.0, 1.0].map(|metres| Observed::Position([metres; 3]))
         };
-        self.plan(&x, &x_g, 0).map(drop).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))
+        let ends = self.method.encode(&ends);
+        let queries = [Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] }];
+        let planned = self.plan(&queries, None, || false).remove(0);
+        planned.map(drop).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))
     }
 
-    /// Checks that observations like this one, which came as `field`, are what the model takes.
+    /// Checks that the model can do what is asked of it.
     ///
     /// # Errors
-    /// If they are not.
-    pub(crate) fn check_takes(&self, field: &str, observation: &Observation) -> Result<(), Error> {
+    /// If the goal or the observation is not what it takes, or was rendered differently; if it is to search and cannot, or to
+    /// start from actions that are not as many as it plans.
+    pub(crate) fn check(&self, task: &PlanTask) -> Result<(), Error> {
+        self.check_takes(task.goal_field, &task.goal)?;
+        self.check_takes(task.observation_field(), &task.observation)?;
+        task.check_render_specs(&self.render_spec)?;
+        if self.method.updates().is_none() {
+            let asked = [("search", task.search.is_some()), ("warm_start", !task.warm_start.is_empty())];
+            if let Some((field, _)) = asked.into_iter().find(|(_, asked)| *asked) {
+                return Err(Error::invalid(field, "none for a method that does not plan", self.method.name()));
+            }
+        }
+        let (horizon, size) = (self.method.horizon(), self.method.actions());
+        let start = &task.warm_start;
+        if !start.is_empty() && (start.len() != horizon || start.iter().any(|action| action.len() != size)) {
+            let sizes: Vec<_> = start.iter().map(Vec::len).collect();
+            return Err(Error::invalid(
+                "warm_start",
+                format!("{horizon} actions of {size} numbers"),
+                format!("{sizes:?}"),
+            ));
+        }
+        Ok(())
+    }
+
+    fn check_takes(&self, field: &str, observation: &Observation) -> Result<(), Error> {
         let (input, expected, got) = match observation {
             Observation::Image(_) => (Input::Image, "a position", "an image"),
             Observation::Position(_) => (Input::Position, "an image", "a position"),
@@ -115,35 +147,50 @@ impl Model {
         if self.method.takes(input) { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
     }
 
-    /// The embedding `[1, Z]` of an image of 84 x 84 or of a position.
-    pub(crate) fn encode(&self, observation: &Observation) -> Tensor {
-        match observation {
-            Observation::Image(image) => self.encode_bytes(image.data()),
-            Observation::Position(position) => self.encode_metres(position.metres()),
-        }
+    /// The embeddings `[Z]` of images of 84 x 84 or of positions.
+    pub(crate) fn encode(&mut self, observations: &[&Observation]) -> Vec<Vec<f32>> {
+        let observed = observations.iter().map(|observation| match observation {
+            Observation::Image(image) => Observed::Image(image.data()),
+            Observation::Position(position) => Observed::Position(position.metres()),
+        });
+        self.method.encode(&observed.collect::<Vec<_>>())
     }
 
-    fn encode_bytes(&self, image: &[u8]) -> Tensor {
-        self.method.encode(&images::from_bytes(image).expect("images are checked as they arrive"))
-    }
-
-    fn encode_metres(&self, position: [f32; 3]) -> Tensor {
-        self.method.encode(&positions::from_metres(&[position]))
-    }
-
-    /// Plans from x to x_g, both `[1, Z]`.
+    /// Plans for each query. A search that goes on until the deadline asks `more` before each iteration.
     ///
     /// # Errors
-    /// If any number of the plan is not finite.
-    pub(crate) fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Result<Planned, Error> {
-        let plan = self.method.plan(x, x_g, seed);
-        let actions = plan.actions.squeeze_dim(0).unbind(0).iter().map(floats).collect::<Vec<_>>();
-        let inner_losses = plan.inner_losses.iter().flat_map(floats).collect::<Vec<_>>();
-        let latent_distance = (x.size()[1] > 0).then(|| (x - x_g).norm().double_value(&[]) as f32);
-        check_finite("actions", &actions.concat())?;
-        check_finite("inner_losses", &inner_losses)?;
-        check_finite("latent_distance", latent_distance.as_slice())?;
-        Ok(Planned { actions, inner_losses, latent_distance })
+    /// If any number of a plan is not finite.
+    pub(crate) fn plan(
+        &mut self,
+        queries: &[Query<'_>],
+        search: Option<Search>,
+        mut more: impl FnMut() -> bool,
+    ) -> Vec<Result<Planned, Error>> {
+        let solver = search.map_or(Solver::Gradient, |search| search.solver);
+        let samples = search.and_then(|search| search.samples).unwrap_or(SAMPLES) as usize;
+        let (solver, default) = match solver {
+            Solver::Gradient => (method::Solver::Gradient, self.method.updates().unwrap_or_default()),
+            Solver::Cem => (method::Solver::Cem(samples), GENERATIONS as usize),
+            Solver::Mppi => (method::Solver::Mppi(samples), GENERATIONS as usize),
+            Solver::Hybrid => (method::Solver::Hybrid(samples), GENERATIONS as usize),
+        };
+        let iterations = match search {
+            Some(search) if search.anytime => Iterations::While(&mut more),
+            _ => Iterations::Fixed(search.and_then(|search| search.iterations).map_or(default, |count| count as usize)),
+        };
+        let plans = self.method.plan(queries, &mut method::Search { solver, iterations });
+        plans.into_iter().zip(queries).map(|(plan, query)| Planned::new(plan, query)).collect()
+    }
+}
+
+impl Planned {
+    fn new(plan: Plan, query: &Query<'_>) -> Result<Self, Error> {
+        let squares = query.x.iter().zip(query.x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
+        let latent_distance = (!query.x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);
+        check_finite("actions", plan.actions.iter().flatten())?;
+        check_finite("inner_losses", plan.inner_losses.iter())?;
+        check_finite("latent_distance", latent_distance.iter())?;
+        Ok(Self { plan, latent_distance })
     }
 }
 
@@ -162,14 +209,9 @@ fn read(bytes: &[u8]) -> Result<Checkpoint, Error> {
     checkpoint::from_bytes(bytes).map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))
 }
 
-fn check_finite(field: &str, values: &[f32]) -> Result<(), Error> {
-    match values.iter().find(|value| !value.is_finite()) {
+fn check_finite<'a>(field: &str, mut values: impl Iterator<Item = &'a f32>) -> Result<(), Error> {
+    match values.find(|value| !value.is_finite()) {
         Some(value) => Err(Error::new(Code::Internal, field, "finite numbers", value)),
         None => Ok(()),
     }
-}
-
-/// A float32 vector's values.
-fn floats(vector: &Tensor) -> Vec<f32> {
-    Vec::try_from(vector.to_kind(Kind::Float)).expect("a vector of float32")
 }

@@ -48,7 +48,7 @@ impl Served {
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown name; `FAILED_PRECONDITION` for a checkpoint that is not kept.
-    pub(crate) fn get(&mut self, name: &str, digest: Option<&str>) -> Result<&Model, Error> {
+    pub(crate) fn get(&mut self, name: &str, digest: Option<&str>) -> Result<&mut Model, Error> {
         if !self.by_name.contains_key(name) {
             return Err(unknown_model(name, self.by_name.keys()));
         }
@@ -56,7 +56,9 @@ impl Served {
         match digest {
             Some(digest) if digest != current.info.digest => {
                 let kept = format!("{}, which is served, or one of {} kept before", current.info.digest, retired.len());
-                retired.get(digest).ok_or_else(|| Error::new(Code::FailedPrecondition, "model_digest", kept, digest))
+                retired
+                    .get_mut(digest)
+                    .ok_or_else(|| Error::new(Code::FailedPrecondition, "model_digest", kept, digest))
             }
             _ => Ok(current),
         }

@@ -3,16 +3,16 @@
 use crate::config::Config;
 use crate::core::PlannerCore;
 use crate::follow::Follower;
-use crate::model_thread::queue_full;
+use crate::task::queue_full;
 use anyhow::{anyhow, ensure};
 use std::future::{Future, ready};
 use std::sync::Arc;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::{AbortOnDropHandle, TaskTracker};
-use tracing::warn;
+use tracing::{Instrument, debug_span, warn};
 use wire::planner::ListModelsRequest;
-use wire::{Error, Message, key, query};
+use wire::{Error, Message, key, query, trace};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
@@ -137,6 +137,8 @@ impl Requests {
         let (tasks, runtime) = (tasks.clone(), runtime.clone());
         let callback = move |query: Query| {
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
+            let span = debug_span!("request", otel.kind = "server", key = %query.key_expr());
+            trace::follow(&span, query::traceparent(&query).as_deref());
             let answer = async move {
                 let result = match (&place, query::request(&query)) {
                     (Err(_), _) => Err(queue_full(capacity)),
@@ -147,7 +149,7 @@ impl Requests {
                     warn!(%error, key = %query.key_expr(), "answer not sent");
                 }
             };
-            tasks.spawn_on(answer, &runtime);
+            tasks.spawn_on(answer.instrument(span), &runtime);
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }

@@ -31,8 +31,19 @@ fn the_command_line_wins_over_the_file() {
 }
 
 #[test]
+fn openpi_is_listened_to_where_it_is_said() {
+    let [file, typed] = ["127.0.0.1:8000", "127.0.0.1:8001"];
+    let toml = format!("openpi_listen = '{file}'");
+    for (arguments, expected) in [(&[][..], file), (&["--openpi-listen", typed], typed)] {
+        assert_eq!(load(&toml, arguments).unwrap().openpi_listen, Some(expected.parse().unwrap()));
+    }
+}
+
+#[test]
 fn a_wrong_setting_is_named() {
-    for (file, field) in [("queue_capacity = 0", "queue_capacity"), ("thread = 1", "thread")] {
+    for (file, field) in
+        [("queue_capacity = 0", "queue_capacity"), ("openpi_listen = 8000", "openpi_listen"), ("thread = 1", "thread")]
+    {
         let error = format!("{:#}", load(file, &[]).unwrap_err());
         assert!(error.contains(field), "{error}");
     }

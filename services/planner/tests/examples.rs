@@ -12,7 +12,8 @@ const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
 #[test]
 fn the_readme_shows_the_examples_as_they_are() {
     let readme = std::fs::read_to_string(Path::new(ROOT).join("README.md")).unwrap();
-    for file in ["examples/plan_zenoh.py", "examples/plan_grpc.py", "services/planner/examples/plan.rs"] {
+    let files = ["plan_zenoh.py", "plan_grpc.py", "plan_openpi.py"].map(|file| format!("examples/{file}"));
+    for file in files.iter().map(String::as_str).chain(["services/planner/examples/plan.rs"]) {
         let example = std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
         assert!(readme.contains(&example), "README.md: expected the text of {file}");
     }

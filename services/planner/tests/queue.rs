@@ -5,10 +5,15 @@
 mod common;
 
 use common::{Client, Faulty, Fixture, Gate, image, is, plan_request, soon};
+use cpn::method::{Observed, Query, Search};
+use cpn::{Input, Method, Plan, Random};
+use futures::future::join_all;
 use planner::core::PlannerCore;
 use planner::model::RANDOM;
 use std::future::Future;
 use std::pin::Pin;
+use std::sync::mpsc;
+use std::time::Duration;
 use wire::planner::{PlanRequest, PlanResponse};
 use wire::{Code, Error, proto};
 
@@ -134,5 +139,111 @@ async fn a_failing_plan_fails_alone() {
         is(Code::Internal, "actions", client.plan(plan_request("faulty", 2)).await);
         is(Code::Internal, "plan", client.plan(plan_request("faulty", 3)).await);
         client.plan(plan_request(RANDOM, 4)).await.unwrap();
+    }
+}
+
+/// A method that says how many plans it is asked for at once, and waits like a [`Gate`]'s for the first of them.
+struct Counting(mpsc::Sender<usize>);
+
+impl Method for Counting {
+    fn name(&self) -> &'static str {
+        "random"
+    }
+
+    fn horizon(&self) -> usize {
+        1
+    }
+
+    fn actions(&self) -> usize {
+        4
+    }
+
+    fn updates(&self) -> Option<usize> {
+        None
+    }
+
+    fn takes(&self, _: Input) -> bool {
+        true
+    }
+
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        Random { actions: 4 }.encode(inputs)
+    }
+
+    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
+        self.0.send(queries.len()).unwrap();
+        Random { actions: 4 }.plan(queries, search)
+    }
+}
+
+/// Puts requests in the queue while the model is busy, lets it on, and answers how many were planned at once.
+async fn planned_together(fixture: &Fixture, requests: Vec<proto::PlanRequest>) -> (Vec<usize>, Vec<PlanResponse>) {
+    let core = fixture.planner.core();
+    let (sender, counts) = mpsc::channel();
+    common::serve(&core, "counting", Box::new(Counting(sender))).await;
+    let gate = Gate::serve(&core).await;
+    let running = enqueue(&core, plan_request("gated", 1)).await;
+    assert_eq!(gate.entered().await, 1);
+    let mut waiting = Vec::new();
+    for request in requests {
+        waiting.push(enqueue(&core, request).await);
+    }
+    gate.open();
+    running.await.unwrap();
+    let answers = join_all(waiting).await.into_iter().map(Result::unwrap).collect();
+    (counts.try_iter().collect(), answers)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_waits_is_planned_together() {
+    let fixture = Fixture::start(&[], |config| config.batch_size = 4.try_into().unwrap()).await;
+    // Those for another model in between do not part them; one more than fits waits for the next batch.
+    let models = ["counting", RANDOM, "counting", "counting", RANDOM, "counting", "counting"];
+    let requests: Vec<_> = models.iter().zip(0..).map(|(model, seed)| plan_request(model, seed)).collect();
+    let (counts, together) = planned_together(&fixture, requests.clone()).await;
+    assert_eq!(counts, [4, 1]);
+    let [client, ..] = fixture.clients();
+    for (request, answer) in requests.into_iter().zip(together) {
+        let alone = client.plan(proto::PlanRequest { model: RANDOM.into(), ..request }).await.unwrap();
+        assert_eq!(alone.actions, answer.actions, "each gets its own plan");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_batch_fails_one_by_one() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    let core = fixture.planner.core();
+    common::serve(&core, "faulty", Box::new(Faulty)).await;
+    let gate = Gate::serve(&core).await;
+    let running = enqueue(&core, plan_request("gated", 1)).await;
+    assert_eq!(gate.entered().await, 1);
+    let [even, odd] =
+        [enqueue(&core, plan_request("faulty", 2)).await, enqueue(&core, plan_request("faulty", 3)).await];
+    gate.open();
+    running.await.unwrap();
+    is(Code::Internal, "actions", even.await);
+    is(Code::Internal, "plan", odd.await);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_would_be_late_is_refused_at_once() {
+    let fixture = Fixture::start(&[], |_| ()).await;
+    let core = fixture.planner.core();
+    let gate = Gate::serve(&core).await;
+    for seed in [1, 2] {
+        let slow = enqueue(&core, plan_request("gated", seed)).await;
+        assert_eq!(gate.entered().await, seed);
+        if seed == 2 {
+            // By the first plan, one takes longer than this.
+            for client in fixture.clients() {
+                let request = proto::PlanRequest { deadline_ms: 50, ..plan_request("gated", 3) };
+                is(Code::ResourceExhausted, "queue", client.plan(request).await);
+                let patient = proto::PlanRequest { deadline_ms: 60_000, ..plan_request(RANDOM, 3) };
+                drop(enqueue(&core, patient).await);
+            }
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        gate.open();
+        slow.await.unwrap();
     }
 }

@@ -28,7 +28,7 @@ use zenoh::Session;
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let cli = Cli::parse();
-    telemetry::init();
+    let _telemetry = telemetry::init("cpn-trainer")?;
     match cli.command {
         Command::Serve(arguments) => {
             serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await

@@ -6,7 +6,7 @@ mod common;
 
 use common::{episode, info, keep, steps};
 use cpn::recipe::GoalSampling;
-use cpn::{Agent, Input, Method, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
+use cpn::{Agent, Input, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
 use recording::Episode;
 use std::path::Path;
 use tch::Tensor;
@@ -59,7 +59,7 @@ fn distance(hand: [f32; 3]) -> f32 {
 fn end(agent: &Agent, mut hand: [f32; 3]) -> [f32; 3] {
     let x_g = agent.encode(&positions::from_metres(&[GOAL]));
     for _ in 0..ACTIONS {
-        let plan = agent.plan(&agent.encode(&positions::from_metres(&[hand])), &x_g, 0);
+        let plan = agent.plan(&agent.encode(&positions::from_metres(&[hand])), &x_g);
         let action: Vec<f32> = Vec::try_from(plan.actions.select(1, 0).flatten(0, -1).clamp(-1.0, 1.0)).unwrap();
         hand = [0, 1, 2].map(|axis| hand[axis] + action[axis] / 100.0);
     }

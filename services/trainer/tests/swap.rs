@@ -161,14 +161,5 @@ async fn plan(session: &Session, model_digest: Option<String>) -> PlanResponse {
 fn request(model_digest: Option<String>) -> PlanRequest {
     let image = |shade| Image::new(84, 84, vec![shade; cpn::images::BYTES]).unwrap();
     let (goal, observation) = (Goal::Image(image(255)), image(0));
-    PlanRequest {
-        model: MODEL.into(),
-        goal,
-        observation: observation.into(),
-        seed: 0,
-        deadline: None,
-        model_digest,
-        search: None,
-        warm_start: Vec::new(),
-    }
+    PlanRequest { model_digest, ..PlanRequest::new(MODEL, goal, observation.into()) }
 }

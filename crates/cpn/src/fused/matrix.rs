@@ -10,6 +10,11 @@ use std::marker::PhantomData;
 const REGISTERS: usize = 2;
 /// Rows that are multiplied at once, as many as there are registers for.
 const ROWS: usize = 8;
+/// Panels that a single row is multiplied by at once: enough sums side by side that none waits for the one before.
+const PANELS: usize = 4;
+
+/// Numbers of a single row that are looked through at once for zeros.
+const CHUNK: usize = 64;
 
 /// b of a product, `[inner, columns]`, in panels of as many columns as fill some registers.
 #[derive(Debug, Clone, Copy)]
@@ -103,37 +108,43 @@ impl<T: Real> WithSimd for Product<'_, T> {
         let Matrix { inner, columns, .. } = self.b;
         let rows = self.c.len() / columns;
         assert!(self.a.len() == rows * inner && self.c.len() == rows * columns, "shapes of a product");
-        for panel in 0..columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
-            let mut row = 0;
-            while row + ROWS <= rows {
-                self.tile::<S, ROWS>(simd, panel, row);
-                row += ROWS;
+        let panels = columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
+        let whole = rows - rows % ROWS;
+        for panel in 0..panels {
+            for row in (0..whole).step_by(ROWS) {
+                self.tile::<S, ROWS, 1>(simd, panel, row);
             }
-            while row < rows {
-                self.tile::<S, 1>(simd, panel, row);
-                row += 1;
+        }
+        // A few rows by themselves are bound by how fast b can be read.
+        for row in whole..rows {
+            let wide = panels - panels % PANELS;
+            for panel in (0..wide).step_by(PANELS) {
+                self.tile::<S, 1, PANELS>(simd, panel, row);
+            }
+            for panel in wide..panels {
+                self.tile::<S, 1, 1>(simd, panel, row);
             }
         }
     }
 }
 
 impl<T: Real> Product<'_, T> {
-    /// R rows of c, from `row` on, at a panel.
+    /// R rows of c, from `row` on, at P panels, from `panel` on.
     #[inline(always)]
-    fn tile<S: Simd, const R: usize>(&mut self, simd: S, panel: usize, row: usize) {
+    fn tile<S: Simd, const R: usize, const P: usize>(&mut self, simd: S, panel: usize, row: usize) {
         let Matrix { inner, columns, stride, apart, values } = self.b;
-        let b = &values[panel * apart..];
+        let b: [&[T]; P] = std::array::from_fn(|p| &values[(panel + p) * apart..]);
         let sums = if self.turned {
             let rows = self.a.len() / inner;
-            sums::<S, T, R>(simd, inner, |r, k| self.a[k * rows + row + r], (b, stride))
+            sums::<S, T, R, P>(simd, inner, |r, k| self.a[k * rows + row + r], (b, stride))
         } else {
             let a: [&[T]; R] = std::array::from_fn(|r| &self.a[(row + r) * inner..][..inner]);
-            sums::<S, T, R>(simd, inner, |r, k| a[r][k], (b, stride))
+            sums::<S, T, R, P>(simd, inner, |r, k| a[r][k], (b, stride))
         };
-        let first = panel * REGISTERS * Lanes::<S, T>::COUNT;
-        for (r, sums) in sums.into_iter().enumerate() {
-            let line = &mut self.c[(row + r) * columns..][..columns][first..];
-            for (part, sum) in line.chunks_mut(Lanes::<S, T>::COUNT).zip(sums) {
+        let count = Lanes::<S, T>::COUNT;
+        for (r, sums) in sums.iter().enumerate() {
+            let line = &mut self.c[(row + r) * columns..][..columns][panel * REGISTERS * count..];
+            for (part, sum) in line.chunks_mut(count).zip(sums.as_flattened()) {
                 if self.accumulate {
                     sum.add_to(part);
                 } else {
@@ -144,25 +155,42 @@ impl<T: Real> Product<'_, T> {
     }
 }
 
-/// Along the inner dimension: R rows of a times a panel of b, whose rows are `stride` apart.
+/// Along the inner dimension: R rows of a times P panels of b, whose rows are `stride` apart.
 #[inline(always)]
-fn sums<S: Simd, T: Real, const R: usize>(
+fn sums<S: Simd, T: Real, const R: usize, const P: usize>(
     simd: S,
     inner: usize,
     a: impl Fn(usize, usize) -> T,
-    (b, stride): (&[T], usize),
-) -> [[Lanes<S, T>; REGISTERS]; R] {
+    (b, stride): ([&[T]; P], usize),
+) -> [[[Lanes<S, T>; REGISTERS]; P]; R] {
     let count = Lanes::<S, T>::COUNT;
-    let mut sums = [[Lanes::splat(simd, T::ZERO); REGISTERS]; R];
-    for k in 0..inner {
-        let line = &b[k * stride..];
-        let b: [_; REGISTERS] = std::array::from_fn(|i| Lanes::load(simd, line.get(i * count..).unwrap_or_default()));
-        for r in 0..R {
-            let a = Lanes::splat(simd, a(r, k));
-            for i in 0..REGISTERS {
-                sums[r][i] = a.mul_add(b[i], sums[r][i]);
+    let mut sums = [[[Lanes::splat(simd, T::ZERO); REGISTERS]; P]; R];
+    let mut add = |k: usize| {
+        for p in 0..P {
+            let line = &b[p][k * stride..];
+            let b: [_; REGISTERS] =
+                std::array::from_fn(|i| Lanes::load(simd, line.get(i * count..).unwrap_or_default()));
+            for (r, sums) in sums.iter_mut().enumerate() {
+                let a = Lanes::splat(simd, a(r, k));
+                for (sum, b) in sums[p].iter_mut().zip(b) {
+                    *sum = a.mul_add(b, *sum);
+                }
             }
         }
+    };
+    if R == 1 && P > 1 {
+        // A single row waits for b to be read; half of it need not be where a is what a rectified linear unit left.
+        let mut places = [0; CHUNK];
+        for start in (0..inner).step_by(CHUNK) {
+            let mut count = 0;
+            for k in start..inner.min(start + CHUNK) {
+                places[count] = k;
+                count += usize::from(a(0, k) != T::ZERO);
+            }
+            places[..count].iter().for_each(|k| add(*k));
+        }
+    } else {
+        (0..inner).for_each(add);
     }
     sums
 }

@@ -17,24 +17,32 @@
 //! Tested against autograd in float64 (`tests/fused.rs`).
 
 mod dense;
+mod encoder;
 mod gate;
 mod gated;
+mod inner;
 mod lanes;
 mod linear;
 mod matrix;
 mod modulation;
 mod network;
 mod outer;
+mod planner;
 mod real;
+mod sampling;
 
 pub use linear::{Weights, add};
 pub use outer::Samples;
+pub use planner::Planner;
 pub use real::Real;
 
 use crate::config::ModelConfig;
 use network::Network;
 use outer::{Settings, Sums, Workspace};
 use rayon::prelude::*;
+use std::collections::HashMap;
+use tch::Tensor;
+use tch::kind::Element;
 
 /// R, the samples of a block.
 const BLOCK: usize = 16;
@@ -128,4 +136,18 @@ impl<T: Real> OuterLoop<T> {
         parts.for_each(|part| sums.add(part));
         OuterGradient { loss: sums.loss, x, x_g, weights: sums.into_weights(updates > 0) }
     }
+}
+
+/// An agent's weights.
+pub(crate) struct Variables<'a>(pub &'a HashMap<String, Tensor>);
+
+impl<T: Element + Copy> Weights<T> for Variables<'_> {
+    fn get(&self, name: &str) -> Vec<T> {
+        floats(&self.0[name])
+    }
+}
+
+/// A tensor's numbers, row by row.
+pub(crate) fn floats<T: Element + Copy>(tensor: &Tensor) -> Vec<T> {
+    Vec::try_from(tensor.flatten(0, -1)).expect("a tensor of the kind that was asked for")
 }

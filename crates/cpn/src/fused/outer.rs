@@ -1,7 +1,8 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
 use super::dense::Order;
-use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes, Step};
+use super::inner::{Actions, Rollout, clamp};
+use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
 use super::real::Real;
 
 /// What the rows of a batch are about.
@@ -57,15 +58,6 @@ pub struct Workspace<T> {
     x_hat: Vec<T>,
 }
 
-#[derive(Debug)]
-struct Rollout<T> {
-    steps: Vec<Step<T>>,
-    /// x_H - x_g, `[R, Z]`.
-    miss: Vec<T>,
-    /// The inner loss' gradient in the actions, `[H, R, A]`.
-    gradient: Vec<T>,
-}
-
 impl<'a, T: Real> Samples<'a, T> {
     /// How many, with Z.
     pub fn rows(&self, latent: usize) -> usize {
@@ -115,13 +107,8 @@ impl<T: Real> Workspace<T> {
     pub fn new(network: &Network<T>, rows: usize, horizon: usize, updates: usize) -> Self {
         let Sizes { latent, actions, .. } = network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; rows * columns];
-        let rollout = || Rollout {
-            steps: (0..horizon).map(|_| network.step(rows)).collect(),
-            miss: zeros(latent),
-            gradient: zeros(horizon * actions),
-        };
         Self {
-            rollouts: (0..updates.max(1)).map(|_| rollout()).collect(),
+            rollouts: (0..updates.max(1)).map(|_| Rollout::new(network, rows, horizon)).collect(),
             buffers: network.buffers(rows),
             actions: zeros(horizon * actions),
             actions_hat: zeros(horizon * actions),
@@ -145,7 +132,7 @@ impl<T: Real> Workspace<T> {
         x_hat.fill(T::ZERO);
         x_g_hat.fill(T::ZERO);
         for k in 0..self.rollouts.len() {
-            self.roll_out(network, settings, samples, rows, k);
+            self.roll_out(network, settings, samples, k);
             if settings.updates > 0 {
                 self.update(network, settings, rows, k);
             }
@@ -164,45 +151,20 @@ impl<T: Real> Workspace<T> {
     }
 
     /// Rollout k: along the policy's actions if it is the first, along the plan's otherwise.
-    fn roll_out(
-        &mut self,
-        network: &Network<T>,
-        settings: Settings<T>,
-        samples: Samples<'_, T>,
-        rows: usize,
-        k: usize,
-    ) {
+    fn roll_out(&mut self, network: &Network<T>, settings: Settings<T>, samples: Samples<'_, T>, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
-        let Rollout { steps, miss, .. } = &mut rollouts[k];
         let x = &mut x[..samples.x.len()];
         x.copy_from_slice(samples.x);
-        for (t, action) in actions[..].chunks_mut(rows * network.sizes.actions).take(settings.horizon).enumerate() {
-            network.features(rows, &mut steps[t], x, samples.x_g);
-            if k == 0 {
-                network.policy(rows, &mut steps[t], action);
-            }
-            if settings.moves(t) {
-                network.next(rows, &mut steps[t], action, x, buffers);
-            }
-        }
-        for (miss, (x, x_g)) in miss.iter_mut().zip(x.iter().zip(samples.x_g)) {
-            *miss = *x - *x_g;
-        }
+        let source = if k == 0 { Actions::Proposed } else { Actions::Given };
+        rollouts[k].forward(network, (x, samples.x_g), (source, actions), settings.updates > 0, buffers);
     }
 
-    /// Update k of the actions: a step down the Huber loss (δ = 1) between x_H and x_g, by its gradient in the actions.
+    /// Update k of the actions: a step down the inner loss, by its gradient in the actions.
     fn update(&mut self, network: &Network<T>, settings: Settings<T>, rows: usize, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
-        let Rollout { steps, miss, gradient } = &mut rollouts[k];
-        let x_bar = &mut x[..rows * network.sizes.latent];
-        for (x_bar, miss) in x_bar.iter_mut().zip(miss.iter()) {
-            *x_bar = clamp(*miss);
-        }
-        let size = rows * network.sizes.actions;
-        for t in (0..settings.horizon).rev() {
-            network.backward(rows, t == 0, &mut steps[t], x_bar, &mut gradient[t * size..][..size], buffers);
-        }
-        for (action, gradient) in actions.iter_mut().zip(&gradient[..settings.horizon * size]) {
+        rollouts[k].backward(network, &mut x[..rows * network.sizes.latent], buffers);
+        let size = settings.horizon * rows * network.sizes.actions;
+        for (action, gradient) in actions.iter_mut().zip(&rollouts[k].gradient[..size]) {
             *action -= settings.step_size * *gradient;
         }
     }
@@ -285,16 +247,5 @@ impl<T> Settings<T> {
     /// Whether the state after step t matters: to the next step, or to the inner loss.
     fn moves(&self, t: usize) -> bool {
         self.updates > 0 || t + 1 < self.horizon
-    }
-}
-
-/// The derivative of the Huber loss with δ = 1.
-fn clamp<T: Real>(x: T) -> T {
-    if x > T::ONE {
-        T::ONE
-    } else if x < -T::ONE {
-        -T::ONE
-    } else {
-        x
     }
 }

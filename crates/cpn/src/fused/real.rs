@@ -32,8 +32,12 @@ pub trait Real:
 
     /// A count as a number.
     fn count(n: usize) -> Self;
+    /// The nearest number.
+    fn from_f64(value: f64) -> Self;
     /// The hyperbolic tangent.
     fn tanh(self) -> Self;
+    /// The square root.
+    fn sqrt(self) -> Self;
     /// 1 / (1 + e^-x).
     fn sigmoid(self) -> Self;
 
@@ -71,8 +75,18 @@ macro_rules! real {
         }
 
         #[inline(always)]
+        fn from_f64(value: f64) -> Self {
+            value as Self
+        }
+
+        #[inline(always)]
         fn tanh(self) -> Self {
             self.tanh()
+        }
+
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            self.sqrt()
         }
 
         #[inline(always)]

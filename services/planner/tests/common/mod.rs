@@ -5,6 +5,7 @@
 
 use cpn::checkpoint::{self, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig};
+use cpn::method::{Observed, Query, Search};
 use cpn::{Agent, EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
 use planner::model::Model;
@@ -15,7 +16,6 @@ use std::future::Future;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
-use tch::{Device, Kind, Tensor};
 use tempfile::TempDir;
 use tonic::transport::Channel;
 use wire::planner::{
@@ -303,26 +303,36 @@ impl Method for Gated {
         "random"
     }
 
-    fn horizon(&self) -> i64 {
+    fn horizon(&self) -> usize {
         1
+    }
+
+    fn actions(&self) -> usize {
+        4
+    }
+
+    fn updates(&self) -> Option<usize> {
+        None
     }
 
     fn takes(&self, _: Input) -> bool {
         true
     }
 
-    fn encode(&self, images: &Tensor) -> Tensor {
-        Random { actions: 4 }.encode(images)
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        Random { actions: 4 }.encode(inputs)
     }
 
-    fn plan(&self, x: &Tensor, x_g: &Tensor, seed: u64) -> Plan {
-        self.entered.send(seed).unwrap();
-        self.gate.recv_timeout(PATIENCE).unwrap();
-        Random { actions: 4 }.plan(x, x_g, seed)
+    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
+        for query in queries {
+            self.entered.send(query.seed).unwrap();
+            self.gate.recv_timeout(PATIENCE).unwrap();
+        }
+        Random { actions: 4 }.plan(queries, search)
     }
 }
 
-/// A method that fails: on even seeds its actions are not numbers, on odd ones libtorch panics.
+/// A method that fails: on even seeds its actions are not numbers, on odd ones it panics.
 pub struct Faulty;
 
 impl Method for Faulty {
@@ -330,22 +340,32 @@ impl Method for Faulty {
         "random"
     }
 
-    fn horizon(&self) -> i64 {
+    fn horizon(&self) -> usize {
         1
+    }
+
+    fn actions(&self) -> usize {
+        4
+    }
+
+    fn updates(&self) -> Option<usize> {
+        None
     }
 
     fn takes(&self, _: Input) -> bool {
         true
     }
 
-    fn encode(&self, images: &Tensor) -> Tensor {
-        Random { actions: 4 }.encode(images)
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        Random { actions: 4 }.encode(inputs)
     }
 
-    fn plan(&self, x: &Tensor, _x_g: &Tensor, seed: u64) -> Plan {
-        let actions = Tensor::full([1, 1, 4], f64::NAN, (Kind::Float, Device::Cpu));
-        let actions = if seed.is_multiple_of(2) { actions } else { actions.matmul(x) };
-        Plan { actions, inner_losses: Vec::new() }
+    fn plan(&mut self, queries: &[Query<'_>], _: &mut Search<'_>) -> Vec<Plan> {
+        let plan = |query: &Query<'_>| {
+            assert!(query.seed.is_multiple_of(2), "an odd seed");
+            Plan { actions: vec![vec![f32::NAN; 4]], inner_losses: Vec::new(), iterations: 0 }
+        };
+        queries.iter().map(plan).collect()
     }
 }
 

@@ -1,4 +1,5 @@
-//! The inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks").
+//! The inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks"), by
+//! autograd. What is served does the same without a graph ([`crate::fused`]).
 
 use crate::dynamics::PolicyDynamics;
 use tch::{Kind, Reduction, Tensor};
@@ -8,7 +9,7 @@ const HUBER_DELTA: f64 = 1.0;
 
 /// A planned action sequence and how close it is predicted to come.
 #[derive(Debug)]
-pub struct Plan {
+pub struct TensorPlan {
     /// â_{t:t+H}, `[B, H, A]`; not clipped.
     pub actions: Tensor,
     /// The inner loss of each plan `[B]`, before each update and, unless training, after the last; empty for methods
@@ -34,7 +35,7 @@ impl InnerLoop<'_> {
     ///
     /// Each plan of a batch is independent of the others: the loss is summed over the batch, so that the step an action
     /// takes does not depend on B.
-    pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> Plan {
+    pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         let _grad = tch::no_grad_guard();
         let mut actions = self.policy_rollout(x, x_g);
         let mut inner_losses = Vec::new();
@@ -45,11 +46,11 @@ impl InnerLoop<'_> {
             actions = leaf.detach() - self.step_size * gradient;
         }
         inner_losses.push(self.loss(x, x_g, &actions));
-        Plan { actions, inner_losses }
+        TensorPlan { actions, inner_losses }
     }
 
     /// The same plan with the graph of every update kept, for the outer loop to differentiate through.
-    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Plan {
+    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         let mut actions = self.policy_rollout(x, x_g);
         let mut inner_losses = Vec::new();
         for _ in 0..self.updates {
@@ -58,7 +59,7 @@ impl InnerLoop<'_> {
             // Not `-=`, which would overwrite what the graph still needs.
             actions = &actions - self.step_size * gradient;
         }
-        Plan { actions, inner_losses }
+        TensorPlan { actions, inner_losses }
     }
 
     /// The initial plan: the actions `[B, H, A]` of the policy along its own predicted states.

@@ -1,0 +1,187 @@
+//! The encoder f_φ for planning: convolutions as products with patches of the image.
+
+use super::gate::rectify;
+use super::linear::{Linear, Weights};
+use super::matrix::{Panels, multiply};
+use super::real::Real;
+use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
+use crate::images::{CHANNELS, SIZE};
+use crate::method::Observed;
+
+/// What layer normalisation adds to the variance, as libtorch does.
+const EPSILON: f64 = 1e-5;
+
+/// What suits the input, then a linear layer to the embedding.
+#[derive(Debug)]
+pub struct Encoder<T> {
+    body: Body<T>,
+    linear: Linear<T>,
+    norm: Option<Norm<T>>,
+}
+
+/// From the input to features.
+#[derive(Debug)]
+enum Body<T> {
+    Image {
+        /// What each byte of an image becomes.
+        levels: Box<[T; 256]>,
+        convolutions: Vec<Convolution<T>>,
+    },
+    Position {
+        centre_metres: [f64; 3],
+        scale_metres: T,
+        layers: Vec<Linear<T>>,
+    },
+}
+
+/// A convolution over an image whose channels lie together, `[S, S, C]`, and a rectified linear unit.
+#[derive(Debug)]
+struct Convolution<T> {
+    kernel: usize,
+    stride: usize,
+    channels: usize,
+    /// `[K K C, O]`.
+    weight: Panels<T>,
+    /// `[O]`.
+    bias: Vec<T>,
+}
+
+/// Layer normalisation, `[Z]`.
+#[derive(Debug)]
+struct Norm<T> {
+    weight: Vec<T>,
+    bias: Vec<T>,
+}
+
+/// Room for the passes, kept from image to image.
+#[derive(Debug, Default)]
+pub struct Room<T> {
+    x: Vec<T>,
+    y: Vec<T>,
+    patches: Vec<T>,
+}
+
+impl<T: Real> Encoder<T> {
+    /// Reads the weights of a valid configuration.
+    pub fn new(config: &EncoderConfig, weights: &impl Weights<T>) -> Self {
+        let linear = Linear::named("encoder.linear", weights);
+        let [weight, bias] = ["weight", "bias"].map(|part| format!("encoder.norm.{part}"));
+        let norm = config.layer_norm().then(|| Norm { weight: weights.get(&weight), bias: weights.get(&bias) });
+        match config {
+            EncoderConfig::Image(config) => {
+                let (body, channels) = Body::image(config, weights);
+                // The features lie with their channels last; the weights are turned rather than them.
+                let positions = linear.inputs / channels;
+                let turned = turn(linear.weight(), channels, positions);
+                Self { body, linear: Linear::new(turned, linear.bias().to_vec()), norm }
+            }
+            EncoderConfig::Position(config) => Self { body: Body::position(config, weights), linear, norm },
+        }
+    }
+
+    /// Embeds an image of 84 x 84 or a position, whichever it takes, as `[Z]`.
+    pub fn encode(&self, input: Observed<'_>, room: &mut Room<T>) -> Vec<T> {
+        self.body.features(input, room);
+        let mut embedding = vec![T::ZERO; self.linear.outputs];
+        self.linear.forward(&room.x, &mut embedding);
+        if let Some(norm) = &self.norm {
+            norm.apply(&mut embedding);
+        }
+        embedding
+    }
+}
+
+impl<T: Real> Body<T> {
+    /// The convolutions, and the channels of the last one.
+    fn image(config: &ImageEncoderConfig, weights: &impl Weights<T>) -> (Self, usize) {
+        let mut channels = CHANNELS as usize;
+        let mut convolutions = Vec::new();
+        for (i, conv) in config.convolutions.iter().enumerate() {
+            let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
+            let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
+            let weight = Panels::transposed(&turn(&weight, channels, kernel * kernel), kernel * kernel * channels);
+            convolutions.push(Convolution { kernel, stride, channels, weight, bias });
+            channels = conv.channels as usize;
+        }
+        let half = T::ONE / T::count(2);
+        let levels = Box::new(std::array::from_fn(|level| T::count(level) / T::count(255) - half));
+        (Self::Image { levels, convolutions }, channels)
+    }
+
+    fn position(config: &PositionEncoderConfig, weights: &impl Weights<T>) -> Self {
+        let layer = |i| Linear::named(&format!("encoder.layer.{i}"), weights);
+        Self::Position {
+            centre_metres: config.centre_mm.map(|mm| mm as f64 / 1e3),
+            scale_metres: T::from_f64(config.scale_mm as f64 / 1e3),
+            layers: (0..config.layers.len()).map(layer).collect(),
+        }
+    }
+
+    /// Leaves the features in `room.x`.
+    fn features(&self, input: Observed<'_>, room: &mut Room<T>) {
+        room.x.clear();
+        match (self, input) {
+            (Self::Image { levels, convolutions }, Observed::Image(bytes)) => {
+                room.x.extend(bytes.iter().map(|byte| levels[usize::from(*byte)]));
+                let mut side = SIZE as usize;
+                for convolution in convolutions {
+                    side = convolution.forward(side, room);
+                    std::mem::swap(&mut room.x, &mut room.y);
+                }
+            }
+            (Self::Position { centre_metres, scale_metres, layers }, Observed::Position(metres)) => {
+                let values = metres.iter().zip(centre_metres);
+                room.x.extend(values.map(|(at, centre)| T::from_f64(f64::from(*at) - centre) / *scale_metres));
+                for layer in layers {
+                    room.y.clear();
+                    room.y.resize(layer.outputs, T::ZERO);
+                    layer.forward(&room.x, &mut room.y);
+                    rectify(&mut room.y);
+                    std::mem::swap(&mut room.x, &mut room.y);
+                }
+            }
+            _ => panic!("observations are checked as they arrive"),
+        }
+    }
+}
+
+impl<T: Real> Convolution<T> {
+    /// `room.x`, `[S, S, C]`, to `room.y`, `[S', S', O]`; answers S'.
+    fn forward(&self, side: usize, room: &mut Room<T>) -> usize {
+        let Self { kernel, stride, channels, .. } = *self;
+        let Room { x, y, patches } = room;
+        let size = (side - kernel) / stride + 1;
+        patches.clear();
+        for (top, left) in (0..size).flat_map(|top| (0..size).map(move |left| (top * stride, left * stride))) {
+            for row in top..top + kernel {
+                patches.extend_from_slice(&x[(row * side + left) * channels..][..kernel * channels]);
+            }
+        }
+        y.clear();
+        (0..size * size).for_each(|_| y.extend_from_slice(&self.bias));
+        multiply(true, y, patches, self.weight.matrix());
+        rectify(y);
+        size
+    }
+}
+
+impl<T: Real> Norm<T> {
+    fn apply(&self, x: &mut [T]) {
+        let count = T::count(x.len());
+        let mean = x.iter().copied().sum::<T>() / count;
+        let variance = x.iter().map(|x| (*x - mean) * (*x - mean)).sum::<T>() / count;
+        let scale = T::ONE / (variance + T::from_f64(EPSILON)).sqrt();
+        for (x, (weight, bias)) in x.iter_mut().zip(self.weight.iter().zip(&self.bias)) {
+            *x = (*x - mean) * scale * *weight + *bias;
+        }
+    }
+}
+
+/// Rows `[C, P]`, one after the other, as rows `[P, C]`.
+fn turn<T: Real>(rows: &[T], channels: usize, positions: usize) -> Vec<T> {
+    let row = |row: &[T]| {
+        let at = (0..positions).flat_map(|p| (0..channels).map(move |c| c * positions + p));
+        at.map(|at| row[at]).collect::<Vec<_>>()
+    };
+    rows.chunks_exact(channels * positions).flat_map(row).collect()
+}

@@ -1,0 +1,253 @@
+//! Plans without a graph, in memory that is kept from plan to plan.
+
+use super::encoder::{Encoder, Room};
+use super::inner::{Actions, Rollout};
+use super::linear::Weights;
+use super::network::{Buffers, Network};
+use super::real::Real;
+use super::sampling;
+use super::{BLOCK, Variables};
+use crate::agent::Agent;
+use crate::config::{Input, ModelConfig};
+use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
+use rayon::prelude::*;
+
+/// A learned method as it is served: its weights laid out for planning, in float32. What it plans is what autograd plans from
+/// the same weights ([`crate::inner_loop`]), within rounding; each plan comes out the same, bit for bit, alone or among others.
+#[derive(Debug)]
+pub struct Planner {
+    config: ModelConfig,
+    encoder: Encoder<f32>,
+    dynamics: Dynamics<f32>,
+    workers: Vec<Worker<f32>>,
+}
+
+/// g_θ with what its inner loop needs.
+#[derive(Debug)]
+pub(super) struct Dynamics<T> {
+    pub(super) network: Network<T>,
+    /// α.
+    pub(super) step_size: T,
+    /// H.
+    pub(super) horizon: usize,
+    /// Whether there is a goal to plan towards, or only a policy to ask.
+    pub(super) plans: bool,
+}
+
+/// One thread's memory.
+#[derive(Debug)]
+pub(super) struct Worker<T> {
+    room: Room<T>,
+    pub(super) rollout: Rollout<T>,
+    pub(super) buffers: Buffers<T>,
+    /// x along a rollout, then x̄, `[R, Z]`.
+    pub(super) x: Vec<T>,
+    /// `[R, Z]`.
+    pub(super) x_g: Vec<T>,
+    /// By step, then row, `[H, R, A]`.
+    pub(super) actions: Vec<T>,
+}
+
+impl Planner {
+    /// Lays out an agent's weights for plans on `threads` threads, at least one.
+    pub fn new(agent: &Agent, threads: usize) -> Self {
+        let (config, variables) = (agent.config().clone(), agent.variables().variables());
+        let weights = &Variables(&variables);
+        let dynamics = Dynamics::new(&config, weights);
+        let workers = (0..threads.max(1)).map(|_| Worker::new(&dynamics)).collect();
+        Self { encoder: Encoder::new(&config.encoder, weights), dynamics, workers, config }
+    }
+}
+
+impl<T: Real> Dynamics<T> {
+    fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
+        Self {
+            network: Network::new(config, weights),
+            step_size: weights.get("step_size")[0],
+            horizon: config.horizon as usize,
+            plans: config.method.plans(),
+        }
+    }
+}
+
+impl<T: Real> Worker<T> {
+    fn new(dynamics: &Dynamics<T>) -> Self {
+        let sizes = dynamics.network.sizes;
+        let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];
+        Self {
+            room: Room::default(),
+            rollout: Rollout::new(&dynamics.network, BLOCK, dynamics.horizon),
+            buffers: dynamics.network.buffers(BLOCK),
+            x: zeros(sizes.latent),
+            x_g: zeros(sizes.latent),
+            actions: zeros(dynamics.horizon * sizes.actions),
+        }
+    }
+
+    /// Rolls out from x along the actions, which the policy proposes or somebody has written; answers the inner losses.
+    /// `x` and `x_g` come row by row, `[Z]` each.
+    pub(super) fn roll_out<'a>(
+        &mut self,
+        dynamics: &Dynamics<T>,
+        source: Actions,
+        ends: impl Iterator<Item = (&'a [T], &'a [T])>,
+    ) -> impl Iterator<Item = T> {
+        let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
+        let Self { rollout, buffers, x, x_g, actions, .. } = self;
+        let mut rows = 0;
+        for (from, to) in ends {
+            x[rows * latent..][..latent].copy_from_slice(from);
+            x_g[rows * latent..][..latent].copy_from_slice(to);
+            rows += 1;
+        }
+        let ends = (&mut x[..rows * latent], &x_g[..rows * latent]);
+        rollout.forward(network, ends, (source, actions), dynamics.plans, buffers);
+        rollout.losses(network, rows)
+    }
+
+    /// Moves the actions of the rollout, of R = `rows` plans, a step down the inner loss.
+    pub(super) fn descend(&mut self, dynamics: &Dynamics<T>, rows: usize) {
+        let sizes = dynamics.network.sizes;
+        let Self { rollout, buffers, x, actions, .. } = self;
+        rollout.backward(&dynamics.network, &mut x[..rows * sizes.latent], buffers);
+        for (action, gradient) in
+            actions.iter_mut().zip(&rollout.gradient).take(dynamics.horizon * rows * sizes.actions)
+        {
+            *action -= dynamics.step_size * *gradient;
+        }
+    }
+
+    /// Where step t of plan r of R = `rows` stands among the actions.
+    pub(super) fn action(&mut self, dynamics: &Dynamics<T>, rows: usize, (t, r): (usize, usize)) -> &mut [T] {
+        let size = dynamics.network.sizes.actions;
+        &mut self.actions[(t * rows + r) * size..][..size]
+    }
+}
+
+impl Worker<f32> {
+    /// The plan of row r of R = `rows`, `[H][A]`.
+    pub(super) fn plan(&mut self, dynamics: &Dynamics<f32>, rows: usize, r: usize) -> Vec<Vec<f32>> {
+        (0..dynamics.horizon).map(|t| self.action(dynamics, rows, (t, r)).to_vec()).collect()
+    }
+
+    /// Writes a plan, `[H][A]`, as row r of R = `rows`.
+    pub(super) fn set_plan(&mut self, dynamics: &Dynamics<f32>, rows: usize, r: usize, plan: &[Vec<f32>]) {
+        for (t, action) in plan.iter().enumerate() {
+            self.action(dynamics, rows, (t, r)).copy_from_slice(action);
+        }
+    }
+
+    /// Plans by updates down the inner loss, for at most [`BLOCK`] queries.
+    fn by_gradient(
+        &mut self,
+        dynamics: &Dynamics<f32>,
+        queries: &[Query<'_>],
+        iterations: &mut Iterations<'_>,
+    ) -> Vec<Plan> {
+        let rows = queries.len();
+        let ends = || queries.iter().map(|query| (query.x, query.x_g));
+        let source = if queries[0].start.is_empty() { Actions::Proposed } else { Actions::Given };
+        for (r, query) in queries.iter().enumerate() {
+            self.set_plan(dynamics, rows, r, query.start);
+        }
+        let losses: Vec<f32> = self.roll_out(dynamics, source, ends()).collect();
+        let begun = |(r, loss)| Plan { actions: self.plan(dynamics, rows, r), inner_losses: vec![loss], iterations: 0 };
+        let mut plans: Vec<Plan> = losses.into_iter().enumerate().map(begun).collect();
+        if !dynamics.plans {
+            plans.iter_mut().for_each(|plan| plan.inner_losses.clear());
+            return plans;
+        }
+        let mut done = 0;
+        while iterations.go_on(done) {
+            done += 1;
+            self.descend(dynamics, rows);
+            let losses: Vec<f32> = self.roll_out(dynamics, Actions::Given, ends()).collect();
+            for (r, (plan, loss)) in plans.iter_mut().zip(losses).enumerate() {
+                let best = plan.inner_losses[plan.inner_losses.len() - 1];
+                let better = loss < best || !iterations.keep_best();
+                if better {
+                    plan.actions = self.plan(dynamics, rows, r);
+                    plan.iterations = done;
+                }
+                plan.inner_losses.push(if better { loss } else { best });
+            }
+        }
+        plans
+    }
+
+    fn search(
+        &mut self,
+        dynamics: &Dynamics<f32>,
+        queries: &[Query<'_>],
+        solver: Solver,
+        iterations: &mut Iterations<'_>,
+    ) -> Vec<Plan> {
+        match solver {
+            Solver::Gradient => self.by_gradient(dynamics, queries, iterations),
+            _ => queries.iter().map(|query| sampling::plan(self, dynamics, *query, solver, iterations)).collect(),
+        }
+    }
+}
+
+impl Method for Planner {
+    fn name(&self) -> &'static str {
+        self.config.method.name()
+    }
+
+    fn horizon(&self) -> usize {
+        self.dynamics.horizon
+    }
+
+    fn actions(&self) -> usize {
+        self.dynamics.network.sizes.actions
+    }
+
+    fn updates(&self) -> Option<usize> {
+        self.dynamics.plans.then_some(self.config.updates as usize)
+    }
+
+    fn takes(&self, input: Input) -> bool {
+        self.config.encoder.input() == input
+    }
+
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        let encoder = &self.encoder;
+        spread(&mut self.workers, inputs, 1, |worker, inputs| {
+            inputs.iter().map(|input| encoder.encode(*input, &mut worker.room)).collect()
+        })
+    }
+
+    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
+        let dynamics = &self.dynamics;
+        match search.iterations {
+            Iterations::Fixed(count) => {
+                let solver = search.solver;
+                let block = if solver == Solver::Gradient { BLOCK } else { 1 };
+                spread(&mut self.workers, queries, block, |worker, queries| {
+                    worker.search(dynamics, queries, solver, &mut Iterations::Fixed(count))
+                })
+            }
+            Iterations::While(_) => {
+                let block = |queries| self.workers[0].search(dynamics, queries, search.solver, &mut search.iterations);
+                queries.chunks(BLOCK).flat_map(block).collect()
+            }
+        }
+    }
+}
+
+/// Runs over blocks of the items, on as many threads as there are workers; the results in the order of the items.
+fn spread<I: Sync, O: Send>(
+    workers: &mut [Worker<f32>],
+    items: &[I],
+    block: usize,
+    run: impl Fn(&mut Worker<f32>, &[I]) -> Vec<O> + Sync,
+) -> Vec<O> {
+    let share = items.len().div_ceil(workers.len()).next_multiple_of(block);
+    if share >= items.len() {
+        // Another thread would only have to be woken.
+        return items.chunks(block).flat_map(|items| run(&mut workers[0], items)).collect();
+    }
+    let shares = workers.par_iter_mut().zip(items.par_chunks(share));
+    let parts = shares.map(|(worker, items)| items.chunks(block).flat_map(|items| run(worker, items)).collect());
+    parts.collect::<Vec<Vec<O>>>().into_iter().flatten().collect()
+}

@@ -1,0 +1,147 @@
+//! Searches that try plans and keep what came near the goal.
+
+use super::BLOCK;
+use super::inner::Actions;
+use super::planner::{Dynamics, Worker};
+use crate::method::{Iterations, Plan, Query, Solver};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// Spread of the first generation, of actions that reach from -1 to 1; MPPI's keeps it.
+const SPREAD: f32 = 0.5;
+/// CEM's spread never falls below, so that it goes on looking.
+const LEAST_SPREAD: f32 = 0.05;
+/// One of so many plans is among the best that the next generation is drawn around.
+const ELITE: usize = 8;
+/// MPPI's temperature, in standard deviations of the generation's losses.
+const TEMPERATURE: f32 = 0.1;
+
+/// Actions `[H][A]` with their inner loss.
+#[derive(Debug, Clone)]
+struct Candidate {
+    actions: Vec<Vec<f32>>,
+    loss: f32,
+}
+
+/// Where the next generation is drawn.
+struct Belief {
+    /// `[H][A]`.
+    mean: Vec<Vec<f32>>,
+    spread: Vec<Vec<f32>>,
+}
+
+/// The best plan that generation after generation finds, from the policy's actions or the query's own; the same for the same
+/// seed.
+pub fn plan(
+    worker: &mut Worker<f32>,
+    dynamics: &Dynamics<f32>,
+    query: Query<'_>,
+    solver: Solver,
+    iterations: &mut Iterations<'_>,
+) -> Plan {
+    let mut rng = ChaCha8Rng::seed_from_u64(query.seed);
+    let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
+    worker.set_plan(dynamics, 1, 0, query.start);
+    let loss = roll_out(worker, dynamics, query, source);
+    let mut best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+    let spread = best.actions.iter().map(|action| vec![SPREAD; action.len()]).collect();
+    let mut belief = Belief { mean: best.actions.clone(), spread };
+    let (mut inner_losses, mut found, mut done) = (vec![loss], 0, 0);
+    while iterations.go_on(done) {
+        done += 1;
+        let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { break };
+        let mut generation = draw(&belief, count, &mut rng);
+        evaluate(worker, dynamics, query, &mut generation);
+        generation.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        let mut nearest = generation[0].clone();
+        match solver {
+            Solver::Mppi(_) => belief.mean = weighted_mean(&generation),
+            _ => belief = around(&generation[..(count / ELITE).max(2).min(count)]),
+        }
+        if let Solver::Hybrid(_) = solver {
+            worker.set_plan(dynamics, 1, 0, &belief.mean);
+            roll_out(worker, dynamics, query, Actions::Given);
+            worker.descend(dynamics, 1);
+            let loss = roll_out(worker, dynamics, query, Actions::Given);
+            let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+            if descended.loss < nearest.loss {
+                belief.mean.clone_from(&descended.actions);
+                nearest = descended;
+            }
+        }
+        if nearest.loss < best.loss {
+            (best, found) = (nearest, done);
+        }
+        inner_losses.push(best.loss);
+    }
+    Plan { actions: best.actions, inner_losses, iterations: found }
+}
+
+/// The inner loss of the worker's one plan.
+fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, source: Actions) -> f32 {
+    worker.roll_out(dynamics, source, [(query.x, query.x_g)].into_iter()).sum()
+}
+
+/// Fills in the losses.
+fn evaluate(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, generation: &mut [Candidate]) {
+    for block in generation.chunks_mut(BLOCK) {
+        let rows = block.len();
+        for (r, candidate) in block.iter().enumerate() {
+            worker.set_plan(dynamics, rows, r, &candidate.actions);
+        }
+        let ends = std::iter::repeat_n((query.x, query.x_g), rows);
+        for (candidate, loss) in block.iter_mut().zip(worker.roll_out(dynamics, Actions::Given, ends)) {
+            candidate.loss = loss;
+        }
+    }
+}
+
+fn draw(belief: &Belief, count: usize, rng: &mut ChaCha8Rng) -> Vec<Candidate> {
+    let mut around = |mean: f32, spread: f32| {
+        let noise: f32 = StandardNormal.sample(rng);
+        (mean + spread * noise).clamp(-1.0, 1.0)
+    };
+    let mut action = |(mean, spread): (&Vec<f32>, &Vec<f32>)| {
+        mean.iter().zip(spread).map(|(mean, spread)| around(*mean, *spread)).collect::<Vec<_>>()
+    };
+    let mut one = || belief.mean.iter().zip(&belief.spread).map(&mut action).collect();
+    (0..count).map(|_| Candidate { actions: one(), loss: f32::INFINITY }).collect()
+}
+
+/// Mean and standard deviation of the elites.
+fn around(elites: &[Candidate]) -> Belief {
+    let share = 1.0 / elites.len() as f32;
+    let mean = mean(elites.iter().map(|elite| (share, &elite.actions)));
+    let spread = |t: usize, i: usize| {
+        let squares = elites.iter().map(|elite| (elite.actions[t][i] - mean[t][i]).powi(2));
+        (share * squares.sum::<f32>()).sqrt().max(LEAST_SPREAD)
+    };
+    let spread = (0..mean.len()).map(|t| (0..mean[t].len()).map(|i| spread(t, i)).collect()).collect();
+    Belief { mean, spread }
+}
+
+/// The mean of a sorted generation, weighted by exp(-loss / temperature).
+fn weighted_mean(generation: &[Candidate]) -> Vec<Vec<f32>> {
+    let count = generation.len() as f32;
+    let centre = generation.iter().map(|candidate| candidate.loss).sum::<f32>() / count;
+    let variance = generation.iter().map(|candidate| (candidate.loss - centre).powi(2)).sum::<f32>() / count;
+    let temperature = (TEMPERATURE * variance.sqrt()).max(f32::MIN_POSITIVE);
+    let least = generation[0].loss;
+    let weights: Vec<f32> = generation.iter().map(|candidate| ((least - candidate.loss) / temperature).exp()).collect();
+    let sum: f32 = weights.iter().sum();
+    mean(generation.iter().zip(weights).map(|(candidate, weight)| (weight / sum, &candidate.actions)))
+}
+
+fn mean<'a>(weighted: impl Iterator<Item = (f32, &'a Vec<Vec<f32>>)>) -> Vec<Vec<f32>> {
+    let mut sum: Vec<Vec<f32>> = Vec::new();
+    for (weight, actions) in weighted {
+        if sum.is_empty() {
+            sum = actions.iter().map(|action| vec![0.0; action.len()]).collect();
+        }
+        for (sum, value) in sum.iter_mut().flatten().zip(actions.iter().flatten()) {
+            *sum += weight * value;
+        }
+    }
+    sum
+}

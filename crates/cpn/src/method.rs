@@ -1,0 +1,152 @@
+//! The compared methods behind one interface (section "Methods for comparison").
+
+use crate::config::Input;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Anything that turns an observation and a goal into actions. Model predictive control applies the first action of each
+/// plan and plans anew.
+pub trait Method: Send {
+    /// Short name of the method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    fn name(&self) -> &'static str;
+
+    /// H, the number of actions in a plan.
+    fn horizon(&self) -> usize;
+
+    /// A, the numbers of an action.
+    fn actions(&self) -> usize;
+
+    /// U, the updates of a plan that it was trained with; none if it does not predict where actions lead, so that there is
+    /// nothing to search.
+    fn updates(&self) -> Option<usize>;
+
+    /// Whether observations and goals of this kind can be embedded.
+    fn takes(&self, input: Input) -> bool;
+
+    /// Embeds observations or goals of the kind it takes, each as `[Z]`; Z is 0 for a method that does not look. An embedding
+    /// does not depend on what else is embedded.
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>>;
+
+    /// Plans for each query, all by the same search. A plan does not depend, in any bit, on what else is planned for.
+    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;
+}
+
+/// An observation or a goal.
+#[derive(Debug, Clone, Copy)]
+pub enum Observed<'a> {
+    /// RGB8, `[84, 84, 3]`.
+    Image(&'a [u8]),
+    /// x, y, z in metres.
+    Position([f32; 3]),
+}
+
+/// From where to where.
+#[derive(Debug, Clone, Copy)]
+pub struct Query<'a> {
+    /// x, the observation's embedding, `[Z]`.
+    pub x: &'a [f32],
+    /// x_g, the goal's embedding, `[Z]`.
+    pub x_g: &'a [f32],
+    /// Drives whatever is random.
+    pub seed: u64,
+    /// Actions to search from, `[H][A]`; the policy's if there are none.
+    pub start: &'a [Vec<f32>],
+}
+
+/// How plans are searched for.
+pub struct Search<'a> {
+    /// Which way.
+    pub solver: Solver,
+    /// How many times they are improved.
+    pub iterations: Iterations<'a>,
+}
+
+/// When a search ends.
+pub enum Iterations<'a> {
+    /// After so many.
+    Fixed(usize),
+    /// Once the answer is no.
+    While(&'a mut dyn FnMut() -> bool),
+}
+
+/// Ways to search for the actions whose predicted end is nearest to the goal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Solver {
+    /// Updates by backpropagation through the predicted states (section "Universal planning networks").
+    Gradient,
+    /// The cross-entropy method (Rubinstein, 1999): each generation of so many plans is drawn around the best of the last.
+    Cem(usize),
+    /// Model predictive path integral control (Williams et al., 2017): around the mean of the last, weighted by loss.
+    Mppi(usize),
+    /// [`Solver::Cem`] whose mean takes a step down the gradient after each generation (Bharadhwaj et al., 2020).
+    Hybrid(usize),
+}
+
+/// A planned action sequence and how close it is predicted to come.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// â_{t:t+H}, `[H][A]`; not clipped.
+    pub actions: Vec<Vec<f32>>,
+    /// The inner loss before each iteration and after the last; where a search keeps the best plan, that of the best so far.
+    /// Empty for methods that do not plan.
+    pub inner_losses: Vec<f32>,
+    /// Iterations after which this plan was found.
+    pub iterations: usize,
+}
+
+impl Iterations<'_> {
+    /// Whether there is to be another after `done`.
+    pub(crate) fn go_on(&mut self, done: usize) -> bool {
+        match self {
+            Self::Fixed(count) => done < *count,
+            Self::While(more) => more(),
+        }
+    }
+
+    /// Whether the best plan counts, for nobody knows which will be the last.
+    pub(crate) fn keep_best(&self) -> bool {
+        matches!(self, Self::While(_))
+    }
+}
+
+/// The control of every comparison: uniform actions in [-1, 1], whatever the images show.
+#[derive(Debug)]
+pub struct Random {
+    /// A, the number of continuous actions.
+    pub actions: usize,
+}
+
+impl Method for Random {
+    fn name(&self) -> &'static str {
+        "random"
+    }
+
+    fn horizon(&self) -> usize {
+        1
+    }
+
+    fn actions(&self) -> usize {
+        self.actions
+    }
+
+    fn updates(&self) -> Option<usize> {
+        None
+    }
+
+    fn takes(&self, _input: Input) -> bool {
+        true
+    }
+
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        vec![Vec::new(); inputs.len()]
+    }
+
+    fn plan(&mut self, queries: &[Query<'_>], _search: &mut Search<'_>) -> Vec<Plan> {
+        let plan = |query: &Query<'_>| {
+            let mut rng = ChaCha8Rng::seed_from_u64(query.seed);
+            let action = (0..self.actions).map(|_| rng.random_range(-1.0..=1.0)).collect();
+            Plan { actions: vec![action], inner_losses: Vec::new(), iterations: 0 }
+        };
+        queries.iter().map(plan).collect()
+    }
+}

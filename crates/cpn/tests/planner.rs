@@ -1,0 +1,224 @@
+//! What is served against the reference by autograd, and what searches promise.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use common::{double_agent, noise_images, position_config, small_config, uniform};
+use cpn::images;
+use cpn::method::{Iterations, Observed, Query, Search, Solver};
+use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Planner, Random};
+use proptest::prelude::*;
+use tch::{Kind, Tensor};
+
+/// Relative, of float32 against float64.
+const TOLERANCE: f64 = 1e-5;
+const SAMPLERS: [Solver; 3] = [Solver::Cem(40), Solver::Mppi(40), Solver::Hybrid(40)];
+
+fn floats(tensor: &Tensor) -> Vec<f64> {
+    Vec::try_from(tensor.to_kind(Kind::Double).flatten(0, -1)).unwrap()
+}
+
+/// The same weights in float64, to compare with, and laid out for planning.
+fn both(config: ModelConfig, step_size: f64, threads: usize) -> (Agent, Planner) {
+    let (double, single) = agents(config, step_size);
+    (double, Planner::new(&single, threads))
+}
+
+/// The same weights in float64 and in float32.
+fn agents(config: ModelConfig, step_size: f64) -> (Agent, Agent) {
+    let agent = double_agent(config.clone());
+    let _ = tch::no_grad(|| agent.variables().variables()["step_size"].shallow_clone().fill_(step_size));
+    let single = Agent::new(config, 0);
+    let weights = agent.variables().variables();
+    for (name, mut variable) in single.variables().variables() {
+        tch::no_grad(|| variable.copy_(&weights[&name]));
+    }
+    (agent, single)
+}
+
+/// Rows `[Z]` of float32, and the same numbers as `[B, Z]`.
+fn embeddings(rows: usize, latent: i64, seed: u64) -> (Vec<Vec<f32>>, Tensor) {
+    let values = (uniform(&[rows as i64, latent], seed) * 1.5).to_kind(Kind::Float);
+    let row = |row| floats(&values.get(row)).into_iter().map(|value| value as f32).collect();
+    ((0..rows as i64).map(row).collect(), values.to_kind(Kind::Double))
+}
+
+fn queries<'a>(x: &'a [Vec<f32>], x_g: &'a [Vec<f32>], start: &'a [Vec<f32>]) -> Vec<Query<'a>> {
+    let seeds = 0..x.len() as u64;
+    x.iter().zip(x_g).zip(seeds).map(|((x, x_g), seed)| Query { x, x_g, seed, start }).collect()
+}
+
+fn fixed<'a>(solver: Solver, count: usize) -> Search<'a> {
+    Search { solver, iterations: Iterations::Fixed(count) }
+}
+
+/// As close to the float64 numbers as float32 ones can be that came by another way, `rounding` away.
+fn assert_close(what: &str, ours: impl Iterator<Item = f32>, reference: &[f64], rounding: f64) {
+    let scale = reference.iter().fold(1.0f64, |most, value| most.max(value.abs()));
+    let ours: Vec<f32> = ours.collect();
+    assert_eq!(ours.len(), reference.len(), "{what}");
+    for (ours, reference) in ours.iter().zip(reference) {
+        let error = (f64::from(*ours) - reference).abs();
+        assert!(error < TOLERANCE * scale + 4.0 * rounding, "{what}: {ours} for {reference}, others {rounding:e} away");
+    }
+}
+
+fn farthest(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+fn sizes() -> impl Strategy<Value = ModelConfig> {
+    let method =
+        prop_oneof![Just(MethodKind::Upn), Just(MethodKind::Cpn), Just(MethodKind::TeBc), Just(MethodKind::Bc)];
+    (method, 1i64..70, 1i64..40, 1i64..40, 1i64..6, 1i64..9, 0i64..4).prop_map(
+        |(method, latent, hidden, gate_hidden, actions, horizon, updates)| {
+            let mut config = position_config(method);
+            if let EncoderConfig::Position(encoder) = &mut config.encoder {
+                encoder.latent = latent;
+            }
+            let (horizon, updates) = if method.plans() { (horizon, updates) } else { (1, 0) };
+            ModelConfig { hidden, gate_hidden, actions, horizon, updates, ..config }
+        },
+    )
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn plans_are_those_of_autograd(config in sizes(), rows in 1usize..40, seed in 0u64..1000) {
+        let (latent, updates) = (config.encoder.latent(), config.updates as usize);
+        let (agent, single) = agents(config, 0.05);
+        let mut planner = Planner::new(&single, 1);
+        let ((x, xs), (x_g, x_gs)) = (embeddings(rows, latent, seed), embeddings(rows, latent, seed + 1));
+        let reference = agent.plan(&xs, &x_gs);
+        // An untrained model's rollouts can be steep, so that rounding grows along them, autograd's as much as ours.
+        let rounded = single.plan(&xs.to_kind(Kind::Float), &x_gs.to_kind(Kind::Float));
+        let plans = planner.plan(&queries(&x, &x_g, &[]), &mut fixed(Solver::Gradient, updates));
+        for (row, plan) in plans.iter().enumerate() {
+            let actions = floats(&reference.actions.get(row as i64));
+            let rounding = farthest(&floats(&rounded.actions.get(row as i64)), &actions);
+            assert_close("actions", plan.actions.iter().flatten().copied(), &actions, rounding);
+            let row_of = |losses: &[Tensor]| losses.iter().map(|l| l.double_value(&[row as i64])).collect::<Vec<_>>();
+            let losses = row_of(&reference.inner_losses);
+            let rounding = farthest(&row_of(&rounded.inner_losses), &losses);
+            assert_close("inner_losses", plan.inner_losses.iter().copied(), &losses, rounding);
+            assert_eq!(plan.iterations, updates);
+        }
+    }
+}
+
+#[test]
+fn embeddings_are_those_of_libtorch() {
+    for method in [MethodKind::Bc, MethodKind::Cpn] {
+        for config in [small_config(method), ModelConfig::paper(method)] {
+            let (agent, mut planner) = both(config, 1.0, 1);
+            let images = noise_images(3, 1);
+            let reference = agent.encode(&images);
+            let bytes: Vec<u8> = Vec::try_from(images.flatten(0, -1)).unwrap();
+            let inputs: Vec<_> = bytes.chunks_exact(images::BYTES).map(Observed::Image).collect();
+            for (row, x) in planner.encode(&inputs).into_iter().enumerate() {
+                assert_close("x", x.into_iter(), &floats(&reference.get(row as i64)), 0.0);
+            }
+        }
+        let (agent, mut planner) = both(position_config(method), 1.0, 1);
+        let positions = [[0.4, -0.2, 0.1], [0.9, 0.3, -0.6]];
+        let reference = agent.encode(&cpn::positions::from_metres(&positions));
+        for (row, x) in planner.encode(&positions.map(Observed::Position)).into_iter().enumerate() {
+            assert_close("x", x.into_iter(), &floats(&reference.get(row as i64)), 0.0);
+        }
+    }
+}
+
+/// In every bit, whatever the batch, the threads and the solver.
+#[test]
+fn a_plan_does_not_depend_on_its_company() {
+    for method in [MethodKind::Cpn, MethodKind::Upn, MethodKind::TeBc] {
+        let config = ModelConfig { updates: if method.plans() { 2 } else { 0 }, ..ModelConfig::paper(method) };
+        let (latent, plans) = (config.encoder.latent(), method.plans());
+        let (_, mut one) = both(config.clone(), 0.5, 1);
+        let (_, mut three) = both(config, 0.5, 3);
+        let ((x, _), (x_g, _)) = (embeddings(45, latent, 1), embeddings(45, latent, 2));
+        let together = queries(&x, &x_g, &[]);
+        for solver in [Solver::Gradient].into_iter().chain(SAMPLERS.into_iter().filter(|_| plans)) {
+            let all = three.plan(&together, &mut fixed(solver, 2));
+            assert_eq!(all, one.plan(&together, &mut fixed(solver, 2)), "{method} {solver:?}");
+            for (query, plan) in together.iter().zip(&all).step_by(11) {
+                assert_eq!(
+                    one.plan(&[*query], &mut fixed(solver, 2)),
+                    std::slice::from_ref(plan),
+                    "{method} {solver:?}"
+                );
+            }
+        }
+        let frames = Vec::<u8>::try_from(noise_images(5, 3).flatten(0, -1)).unwrap();
+        let frames: Vec<_> = frames.chunks_exact(images::BYTES).map(Observed::Image).collect();
+        let all = three.encode(&frames);
+        for (frame, x) in frames.iter().zip(&all) {
+            assert_eq!(one.encode(&[*frame]), std::slice::from_ref(x));
+        }
+    }
+}
+
+fn search(planner: &mut Planner, solver: Solver, iterations: Iterations<'_>, start: &[Vec<f32>]) -> Plan {
+    let ((x, _), (x_g, _)) = (embeddings(1, 6, 1), embeddings(1, 6, 2));
+    planner.plan(&queries(&x, &x_g, start), &mut Search { solver, iterations }).remove(0)
+}
+
+#[test]
+fn samplers_find_better_plans_and_the_same_again() {
+    let (_, mut planner) = both(small_config(MethodKind::Cpn), 0.1, 1);
+    for solver in SAMPLERS {
+        let plan = search(&mut planner, solver, Iterations::Fixed(6), &[]);
+        assert!(plan.inner_losses.is_sorted_by(|a, b| a >= b), "{solver:?}: {:?}", plan.inner_losses);
+        assert!(plan.inner_losses[6] < plan.inner_losses[0], "{solver:?}: {:?}", plan.inner_losses);
+        assert_eq!(search(&mut planner, solver, Iterations::Fixed(6), &[]), plan);
+        let again = search(&mut planner, solver, Iterations::Fixed(plan.iterations), &[]);
+        assert_eq!(again.actions, plan.actions, "{solver:?}: {} iterations give the same plan", plan.iterations);
+    }
+}
+
+#[test]
+fn a_search_goes_on_while_it_may_and_answers_the_best() {
+    // So large a step overshoots, so that the last plan is not the best.
+    let (_, mut planner) = both(small_config(MethodKind::Cpn), 40.0, 1);
+    for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
+        let mut left = 7;
+        let mut more = || {
+            left -= 1;
+            left >= 0
+        };
+        let plan = search(&mut planner, solver, Iterations::While(&mut more), &[]);
+        assert_eq!(plan.inner_losses.len(), 8, "{solver:?}");
+        assert!(plan.inner_losses.is_sorted_by(|a, b| a >= b), "{solver:?}: {:?}", plan.inner_losses);
+        let again = search(&mut planner, solver, Iterations::Fixed(plan.iterations), &[]);
+        assert_eq!(again.actions, plan.actions, "{solver:?}: {} iterations give the same plan", plan.iterations);
+    }
+    let plain = search(&mut planner, Solver::Gradient, Iterations::Fixed(7), &[]);
+    assert!(!plain.inner_losses.is_sorted_by(|a, b| a >= b), "the step must overshoot for this test to say anything");
+}
+
+#[test]
+fn a_search_starts_from_the_actions_it_is_given() {
+    let (_, mut planner) = both(small_config(MethodKind::Cpn), 0.1, 1);
+    let found = search(&mut planner, Solver::Hybrid(40), Iterations::Fixed(6), &[]);
+    for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
+        let warm = search(&mut planner, solver, Iterations::Fixed(0), &found.actions);
+        assert_eq!(warm.actions, found.actions, "{solver:?}");
+        assert_eq!(warm.inner_losses, found.inner_losses[6..], "{solver:?}");
+        assert_ne!(search(&mut planner, solver, Iterations::Fixed(0), &[]).actions, found.actions, "{solver:?}");
+    }
+}
+
+#[test]
+fn random_actions_follow_the_seed() {
+    let mut random = Random { actions: 4 };
+    let mut plan = |seed| {
+        let query = Query { x: &[], x_g: &[], seed, start: &[] };
+        random.plan(&[query], &mut fixed(Solver::Gradient, 0)).remove(0).actions
+    };
+    assert_eq!(plan(1), plan(1));
+    assert_ne!(plan(1), plan(2));
+    assert!(plan(1).iter().flatten().all(|value| value.abs() <= 1.0));
+}

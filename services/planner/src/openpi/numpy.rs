@@ -1,0 +1,109 @@
+//! Numpy arrays in msgpack, as openpi's client packs and unpacks them.
+
+use rmpv::Value;
+use std::collections::BTreeMap;
+use std::fmt;
+use wire::Error;
+
+/// How deep values may nest, as `rmpv` counts: a map is two, and a request has a list in a map in a map. The library's own
+/// limit is more than the stack of a thread holds.
+const MAX_DEPTH: usize = 16;
+
+/// The fields of a message, by name.
+pub(super) type Fields = BTreeMap<String, Value>;
+
+/// A numpy array.
+pub(super) struct Array {
+    /// As numpy names it: byte order, kind, bytes of an element.
+    pub(super) dtype: String,
+    pub(super) shape: Vec<u32>,
+    /// The elements in C order.
+    pub(super) data: Vec<u8>,
+}
+
+impl fmt::Display for Array {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { dtype, shape, data } = self;
+        write!(f, "dtype {dtype}, shape {shape:?}, {} bytes", data.len())
+    }
+}
+
+impl TryFrom<Value> for Array {
+    type Error = Error;
+
+    /// That the data fits the shape is for the reader to check.
+    fn try_from(value: Value) -> Result<Self, Error> {
+        let no_array = |got: &dyn fmt::Display| Error::invalid("", "a numpy array", got);
+        let Value::Map(pairs) = value else { return Err(no_array(&brief(&value))) };
+        let (mut dtype, mut shape, mut data) = (None, None, None);
+        for (key, value) in pairs {
+            match (key.as_slice(), value) {
+                (Some(b"dtype"), value) => dtype = value.as_str().map(str::to_owned),
+                (Some(b"shape"), Value::Array(sides)) => shape = sides.iter().map(side).collect(),
+                (Some(b"data"), Value::Binary(bytes)) => data = Some(bytes),
+                _ => (),
+            }
+        }
+        match (dtype, shape, data) {
+            (Some(dtype), Some(shape), Some(data)) => Ok(Self { dtype, shape, data }),
+            _ => Err(no_array(&"a map without dtype, shape and data of one")),
+        }
+    }
+}
+
+/// What came, for an error: of what may be long, only how long it is.
+pub(super) fn brief(value: &Value) -> String {
+    match value {
+        Value::Map(pairs) => format!("a map of {}", pairs.len()),
+        Value::Array(values) => format!("a list of {}", values.len()),
+        Value::Binary(bytes) => format!("{} bytes", bytes.len()),
+        _ => value.to_string(),
+    }
+}
+
+fn side(value: &Value) -> Option<u32> {
+    value.as_u64()?.try_into().ok()
+}
+
+/// A float32 array `[rows, columns]`; all rows are of one length.
+pub(super) fn matrix(rows: &[Vec<f32>]) -> Value {
+    let shape = [rows.len(), rows.first().map_or(0, Vec::len)];
+    let data: Vec<u8> = rows.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let pairs: [(&[u8], Value); 4] = [
+        (b"__ndarray__", true.into()),
+        (b"data", data.into()),
+        (b"dtype", "<f4".into()),
+        (b"shape", shape.map(Value::from).to_vec().into()),
+    ];
+    Value::Map(pairs.map(|(key, value)| (key.into(), value)).into())
+}
+
+/// A map with names for keys.
+pub(super) fn map<K: Into<Value>>(fields: impl IntoIterator<Item = (K, Value)>) -> Value {
+    Value::Map(fields.into_iter().map(|(name, value)| (name.into(), value)).collect())
+}
+
+/// The bytes of a value.
+pub(super) fn write(value: &Value) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    rmpv::encode::write_value(&mut bytes, value).expect("a vector takes all bytes");
+    bytes
+}
+
+/// The fields of a message.
+///
+/// # Errors
+/// If the bytes are not one map with names for keys.
+pub(super) fn read(mut bytes: &[u8]) -> Result<Fields, Error> {
+    let no_map = |got: &dyn fmt::Display| Error::invalid("payload", "one msgpack map with text for keys", got);
+    let value = rmpv::decode::read_value_with_max_depth(&mut bytes, MAX_DEPTH).map_err(|e| no_map(&e))?;
+    if !bytes.is_empty() {
+        return Err(no_map(&format!("{} bytes more", bytes.len())));
+    }
+    let Value::Map(pairs) = value else { return Err(no_map(&brief(&value))) };
+    let named = |(key, value): (Value, Value)| match key.as_str() {
+        Some(name) => Ok((name.to_owned(), value)),
+        None => Err(no_map(&format!("the key {}", brief(&key)))),
+    };
+    pairs.into_iter().map(named).collect()
+}

@@ -1,0 +1,109 @@
+//! A request to plan on its way to the model.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::{OwnedSemaphorePermit, oneshot};
+use tracing::Span;
+use wire::planner::{PlanResponse, Search};
+use wire::{Code, Error, Observation};
+
+/// A request to plan whose names are resolved and whose images are of the right size.
+#[derive(Debug)]
+pub(crate) struct PlanTask {
+    pub(crate) model: String,
+    /// The checkpoint that must answer.
+    pub(crate) model_digest: Option<String>,
+    pub(crate) goal_id: String,
+    pub(crate) goal: Arc<Observation>,
+    /// The request's field that the goal came from.
+    pub(crate) goal_field: &'static str,
+    pub(crate) observation: Observation,
+    pub(crate) seed: u64,
+    pub(crate) deadline: Option<Duration>,
+    pub(crate) search: Option<Search>,
+    /// `[H][A]`, or nothing.
+    pub(crate) warm_start: Vec<Vec<f32>>,
+    /// Of the request.
+    pub(crate) span: Span,
+}
+
+/// A task in the queue.
+#[derive(Debug)]
+pub(crate) struct Waiting {
+    pub(crate) task: PlanTask,
+    pub(crate) enqueued: Instant,
+    /// Of its time in the queue.
+    pub(crate) queued: Span,
+    /// Given back when the plan starts.
+    pub(crate) place: OwnedSemaphorePermit,
+    pub(crate) reply: oneshot::Sender<Result<PlanResponse, Error>>,
+}
+
+/// Tasks of one kind can be planned together.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Kind {
+    pub(crate) model: String,
+    pub(crate) model_digest: Option<String>,
+    pub(crate) search: Option<Search>,
+    pub(crate) is_warm: bool,
+}
+
+impl PlanTask {
+    pub(crate) fn kind(&self) -> Kind {
+        let Self { model, model_digest, search, warm_start, .. } = self;
+        let (model, model_digest) = (model.clone(), model_digest.clone());
+        Kind { model, model_digest, search: *search, is_warm: !warm_start.is_empty() }
+    }
+
+    /// Whether the plan goes on until its own deadline, so that nobody can share it.
+    pub(crate) fn is_anytime(&self) -> bool {
+        self.search.is_some_and(|search| search.anytime)
+    }
+
+    /// The request's field that the observation came from.
+    pub(crate) fn observation_field(&self) -> &'static str {
+        match self.observation {
+            Observation::Image(_) => "observation",
+            Observation::Position(_) => "position",
+        }
+    }
+
+    /// A plan is only worth something between pictures of one look, and by a model that learnt from that look. What does
+    /// not say how it was rendered goes with everything.
+    ///
+    /// # Errors
+    /// If two of the three were rendered differently.
+    pub(crate) fn check_render_specs(&self, model: &str) -> Result<(), Error> {
+        let (observation, goal) = (self.observation.render_spec(), self.goal.render_spec());
+        let expected = [model, goal].into_iter().find(|spec| !spec.is_empty()).unwrap_or(observation);
+        let goal_field = if self.goal_field == "goal_image" { "goal_image.render_spec" } else { self.goal_field };
+        for (field, got) in [(goal_field, goal), ("observation.render_spec", observation)] {
+            if !got.is_empty() && got != expected {
+                return Err(Error::new(Code::FailedPrecondition, field, expected, got));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Waiting {
+    /// When the answer is no longer of use.
+    pub(crate) fn due(&self) -> Option<Instant> {
+        self.task.deadline.map(|deadline| self.enqueued + deadline)
+    }
+}
+
+/// A queue of `capacity` has no free place.
+pub(crate) fn queue_full(capacity: u16) -> Error {
+    Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{capacity} waiting"))
+}
+
+/// Whoever waits so long gets nothing of use.
+pub(crate) fn too_many(deadline: Duration, wait: Duration) -> Error {
+    let expected = format!("a wait of less than the deadline of {} ms", deadline.as_millis());
+    Error::new(Code::ResourceExhausted, "queue", expected, format!("about {} ms", wait.as_millis()))
+}
+
+pub(crate) fn too_late(deadline: Duration) -> Error {
+    Error::new(Code::DeadlineExceeded, "deadline_ms", format!("an answer within {} ms", deadline.as_millis()), "none")
+}
