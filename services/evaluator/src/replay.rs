@@ -188,13 +188,14 @@ mod tests {
 
     #[test]
     fn each_value_is_compared_by_its_bits() {
+        type Spoil = fn(&mut PlanResponse);
         let recorded = exchange(None);
-        let difference = |spoil: fn(&mut PlanResponse)| {
+        let difference = |spoil: Spoil| {
             let mut now = recorded.response.clone();
             spoil(&mut now);
             compare(3, &recorded, now).map(|found| Replay { plans: 9, difference: Some(found) }.to_string())
         };
-        let cases: [(fn(&mut PlanResponse), &str); 9] = [
+        let cases: [(Spoil, &str); 9] = [
             (|now| now.actions[1][2] = -0.0, "actions[1][2]: recorded 0, now -0"),
             (|now| now.actions[1][0] = 0.5f32.next_up(), "actions[1][0]: recorded 0.5, now 0.50000006"),
             (|now| drop(now.actions.pop()), "actions[1]: recorded 3 values, now 0 values"),
