@@ -31,7 +31,7 @@ fn each_crate_knows_only_what_it_may() {
         ("recording", &["wire"]),
         ("planner", &["cpn", "wire", "service-kit"]),
         ("trainer", &["cpn", "recording", "wire", "service-kit"]),
-        ("evaluator", &["wire", "service-kit"]),
+        ("evaluator", &["recording", "wire", "service-kit"]),
     ]);
     let dependencies = dependencies();
     assert_eq!(

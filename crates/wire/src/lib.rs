@@ -13,6 +13,7 @@ mod message;
 mod observation;
 pub mod planner;
 pub mod query;
+pub mod replay;
 mod search;
 pub mod sim;
 pub mod trace;

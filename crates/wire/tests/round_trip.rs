@@ -9,6 +9,7 @@ use std::time::Duration;
 use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
+use wire::replay::*;
 use wire::sim::*;
 use wire::training::*;
 use wire::{Image, Message, Position, decode, encode};
@@ -171,6 +172,17 @@ proptest! {
     }
 
     #[test]
+    fn planned_episode(
+        variation in variation(),
+        model in name(),
+        model_digest in digest(),
+        goal in prop_oneof![image().prop_map(Into::into), point().prop_map(Into::into)],
+        plans in 1u32..,
+    ) {
+        survives(PlannedEpisode { variation, model, model_digest, goal, plans });
+    }
+
+    #[test]
     fn goals_and_models(
         image in image(),
         goal_id in digest(),
@@ -278,6 +290,7 @@ proptest! {
         let _ = decode::<DemonstrationStep>(&bytes);
         let _ = decode::<CommitEpisodeRequest>(&bytes);
         let _ = decode::<RecordedEpisode>(&bytes);
+        let _ = decode::<PlannedEpisode>(&bytes);
         let _ = decode::<CheckpointAnnouncement>(&bytes);
         let _ = decode::<ListVersionsResponse>(&bytes);
         let _ = decode::<StartRunRequest>(&bytes);

@@ -21,6 +21,8 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Report again from the records of a run.
     Report(ReportArgs),
+    /// Ask a planner again for every plan of a recorded episode, and compare the answers bit for bit.
+    Replay(ReplayArgs),
 }
 
 /// Arguments of `run`.
@@ -76,4 +78,17 @@ pub struct ReportArgs {
     /// Print the summary as JSON instead of a table.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments of `replay`.
+#[derive(Debug, Clone, Args)]
+pub struct ReplayArgs {
+    /// The episode: an MCAP file beside the record of a trial.
+    pub file: PathBuf,
+    /// Name of the planner to ask.
+    #[arg(long, default_value = "planner")]
+    pub planner: String,
+    /// How to join the planner.
+    #[command(flatten)]
+    pub session: SessionConfig,
 }

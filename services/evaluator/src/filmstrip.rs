@@ -1,7 +1,6 @@
 //! Frames for the report: of each task and model the first success and the first failure, by seed.
 
 use crate::record::{self, Folder, Outcome, Trial};
-use crate::trial::Attempt;
 use anyhow::Context;
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use std::fs;
@@ -22,7 +21,7 @@ pub(crate) struct Filmstrip {
 
 /// Keeps the frames of a trial unless those of an earlier seed with the same outcome are there. Strips that it makes
 /// superfluous, later ones and those of other checkpoints, are removed.
-pub(crate) fn keep(folder: &Folder, trial: &Trial, attempt: &Attempt) -> anyhow::Result<()> {
+pub(crate) fn keep(folder: &Folder, trial: &Trial, goal: &Image, frames: &[Image]) -> anyhow::Result<()> {
     let row = row(folder, trial);
     let name = name(trial);
     let (class, _) = name.split_at(name.len() - SEED_DIGITS);
@@ -36,9 +35,9 @@ pub(crate) fn keep(folder: &Folder, trial: &Trial, attempt: &Attempt) -> anyhow:
     let write = || {
         remove(&unfinished)?;
         fs::create_dir_all(&unfinished)?;
-        fs::write(unfinished.join("goal.png"), png(&attempt.goal)?)?;
-        for step in evenly_spaced(attempt.frames.len()) {
-            fs::write(unfinished.join(format!("{step:04}.png")), png(&attempt.frames[step])?)?;
+        fs::write(unfinished.join("goal.png"), png(goal)?)?;
+        for step in evenly_spaced(frames.len()) {
+            fs::write(unfinished.join(format!("{step:04}.png")), png(&frames[step])?)?;
         }
         for strip in strips.iter().filter(|strip| strip.starts_with(outcome)) {
             remove(&row.join(strip))?;
@@ -109,7 +108,7 @@ mod tests {
     use super::*;
     use crate::record::{Episode, GoalSource, StageTimes};
 
-    fn attempt(seed: u64, digest: &str, outcome: Outcome) -> (Trial, Attempt) {
+    fn trial(seed: u64, digest: &str, outcome: Outcome) -> Trial {
         let episode = Episode {
             goal_id: "0".repeat(64),
             steps: 2,
@@ -118,18 +117,21 @@ mod tests {
             last_inner_losses: vec![],
             mean_times: StageTimes::default(),
         };
-        let trial = Trial {
+        Trial {
             format: record::FORMAT,
             task: "reach".into(),
             seed,
             model: "cpn".into(),
             model_digest: digest.repeat(64),
             goal: GoalSource::SameVariation,
-            outcome: outcome.clone(),
-            episode: Some(episode.clone()),
-        };
+            outcome,
+            episode: Some(episode),
+        }
+    }
+
+    fn keep(folder: &Folder, trial: &Trial) {
         let image = Image::new(2, 2, vec![7; 12]).unwrap();
-        (trial, Attempt { outcome, episode, goal: image.clone(), frames: vec![image; 3] })
+        super::keep(folder, trial, &image, &vec![image.clone(); 3]).unwrap();
     }
 
     #[test]
@@ -137,17 +139,17 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = Folder::new(root.path());
         let trials = [
-            attempt(11, "a", Outcome::Success),
-            attempt(9, "a", Outcome::Failure),
-            attempt(10, "a", Outcome::Success),
-            attempt(12, "a", Outcome::Success),
+            trial(11, "a", Outcome::Success),
+            trial(9, "a", Outcome::Failure),
+            trial(10, "a", Outcome::Success),
+            trial(12, "a", Outcome::Success),
         ];
-        for (trial, attempt) in &trials {
-            keep(&folder, trial, attempt).unwrap();
+        for trial in &trials {
+            keep(&folder, trial);
         }
-        let kept = trials.each_ref().map(|(trial, _)| read(&folder, trial).unwrap().is_some());
+        let kept = trials.each_ref().map(|trial| read(&folder, trial).unwrap().is_some());
         assert_eq!(kept, [false, true, true, false]);
-        let frames = read(&folder, &trials[1].0).unwrap().unwrap().frames;
+        let frames = read(&folder, &trials[1]).unwrap().unwrap().frames;
         assert_eq!(frames.iter().map(|(step, _)| *step).collect::<Vec<_>>(), [0, 1, 2]);
     }
 
@@ -155,12 +157,12 @@ mod tests {
     fn another_checkpoint_replaces_the_strips() {
         let root = tempfile::tempdir().unwrap();
         let folder = Folder::new(root.path());
-        let (old, new) = (attempt(1, "a", Outcome::Success), attempt(5, "b", Outcome::Success));
-        for (trial, attempt) in [&old, &new] {
-            keep(&folder, trial, attempt).unwrap();
+        let (old, new) = (trial(1, "a", Outcome::Success), trial(5, "b", Outcome::Success));
+        for trial in [&old, &new] {
+            keep(&folder, trial);
         }
-        assert!(read(&folder, &old.0).unwrap().is_none());
-        assert!(read(&folder, &new.0).unwrap().is_some());
+        assert!(read(&folder, &old).unwrap().is_none());
+        assert!(read(&folder, &new).unwrap().is_some());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //!
 //! Every model is run on the same variations (`queue`), one trial at a time on each worker (`schedule`, `trial`). The
 //! records (`record`, `filmstrip`) are all that the report (`summary`, `table`, `report`) is made from, so that a run
-//! can be interrupted and gone on with.
+//! can be interrupted and gone on with. What the planner was asked in an episode can be asked again (`replay`).
 
 mod chart;
 mod cli;
@@ -12,14 +12,16 @@ mod presence;
 mod progress;
 mod queue;
 mod record;
+mod replay;
 mod report;
 mod schedule;
 mod summary;
 mod table;
 mod trial;
 
-pub use cli::{Cli, Command, ReportArgs, RunArgs};
+pub use cli::{Cli, Command, ReplayArgs, ReportArgs, RunArgs};
 pub use record::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
+pub use replay::{Difference, Replay, replay};
 pub use summary::{Row, Summary, Training};
 pub use table::table;
 
@@ -30,8 +32,9 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 use wire::planner::{ListModelsRequest, ListModelsResponse};
-use wire::{Code, key, query};
+use wire::{Code, Message, key, query};
 use zenoh::Session;
+use zenoh::key_expr::OwnedKeyExpr;
 
 /// Runs what is missing of an evaluation, and reports.
 ///
@@ -92,12 +95,7 @@ pub fn report(out: &Path) -> anyhow::Result<Summary> {
 /// The named models as the planner serves them, or all of them if none is named.
 async fn models(session: &Session, planner: &str, names: &[String], timeout: Duration) -> anyhow::Result<Vec<Model>> {
     let key = key::planner_list_models(planner)?;
-    // Right after connecting, the planner's services may not be known yet.
-    let again = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(10);
-    let ask = || query::call(session, &key, ListModelsRequest, timeout);
-    let response: ListModelsResponse = ask
-        .retry(again)
-        .when(|error: &wire::Error| error.code == Code::Unavailable)
+    let response: ListModelsResponse = ask(session, &key, ListModelsRequest, timeout)
         .await
         .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
     let served = response.models;
@@ -113,6 +111,18 @@ async fn models(session: &Session, planner: &str, names: &[String], timeout: Dur
         model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", known()))
     };
     names.iter().map(find).collect()
+}
+
+/// Asks a planner that has only just been found: right after connecting, its services may not be known yet.
+async fn ask<Q: Message + Clone, R: Message>(
+    session: &Session,
+    key: &OwnedKeyExpr,
+    request: Q,
+    timeout: Duration,
+) -> Result<R, wire::Error> {
+    let again = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(10);
+    let call = || query::call(session, key, request.clone(), timeout);
+    call.retry(again).when(|error: &wire::Error| error.code == Code::Unavailable).await
 }
 
 /// What was typed, fit to be typed again.

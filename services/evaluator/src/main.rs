@@ -1,4 +1,4 @@
-//! `cpn-eval`: measures first-attempt success, and reports it.
+//! `cpn-eval`: measures first-attempt success, reports it, and replays its episodes.
 
 use anyhow::Context;
 use clap::Parser;
@@ -8,24 +8,27 @@ use std::process::ExitCode;
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let _telemetry = service_kit::telemetry::init("cpn-eval")?;
-    let (summary, json) = match Cli::parse().command {
-        Command::Run(args) => (evaluator::run(&args).await?, args.json),
-        Command::Report(args) => (evaluator::report(&args.out)?, args.json),
-    };
-    print(&summary, json)?;
+    match Cli::parse().command {
+        Command::Run(args) => tell(&evaluator::run(&args).await?, args.json),
+        Command::Report(args) => tell(&evaluator::report(&args.out)?, args.json),
+        Command::Replay(args) => {
+            let replay = evaluator::replay(&args).await?;
+            println!("{replay}");
+            Ok(if replay.difference.is_none() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+        }
+    }
+}
+
+fn tell(summary: &Summary, json: bool) -> anyhow::Result<ExitCode> {
+    if json {
+        println!("{}", serde_json::to_string_pretty(summary).context("printing the summary")?);
+    } else {
+        println!("{}", evaluator::table(summary));
+    }
     let errors = summary.errors();
     if errors > 0 {
         tracing::error!("{errors} trials could not be brought to an end; run the same command again for these");
         return Ok(ExitCode::FAILURE);
     }
     Ok(ExitCode::SUCCESS)
-}
-
-fn print(summary: &Summary, json: bool) -> anyhow::Result<()> {
-    if json {
-        println!("{}", serde_json::to_string_pretty(summary).context("printing the summary")?);
-    } else {
-        println!("{}", evaluator::table(summary));
-    }
-    Ok(())
 }

@@ -1,6 +1,7 @@
 //! What a run leaves in its folder: one file that describes it, and one for each trial.
 
 use anyhow::{Context, ensure};
+use recording::plans::{self, Plans};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use service_kit::files::write_atomically;
@@ -186,6 +187,13 @@ impl Folder {
     /// If the file cannot be written.
     pub fn write_trial(&self, trial: &Trial) -> anyhow::Result<()> {
         write_json(&self.trial_path(&trial.task, &trial.model, trial.seed), trial)
+    }
+
+    /// Keeps the plans of a trial beside its record, in place of any earlier ones.
+    pub(crate) fn write_plans(&self, plans: &Plans) -> anyhow::Result<()> {
+        let episode = plans.episode();
+        let record = self.trial_path(&episode.variation.task, &episode.model, episode.variation.seed);
+        write_atomically(&record.with_extension(recording::EXTENSION), &plans::to_bytes(plans)?)
     }
 
     /// Remembers that a variation has no goal image: it is left out for all models.

@@ -116,8 +116,10 @@ impl Schedule {
         match result {
             _ if self.queue.is_skipped(&job.variation) => (),
             Ok(attempt) => {
+                // Before the record, which says that the trial is finished.
+                self.folder.write_plans(&attempt.plans)?;
                 let trial = self.record(&job, attempt.outcome.clone(), Some(&attempt))?;
-                filmstrip::keep(&self.folder, &trial, &attempt)?;
+                filmstrip::keep(&self.folder, &trial, &attempt.goal, &attempt.frames)?;
                 self.progress.count(job.model, attempt.outcome == Outcome::Success);
             }
             Err(Fault::NoGoalImage) => {

@@ -1,8 +1,10 @@
 //! One first attempt: closes the loop between a simulator worker and the planner.
 
 use crate::record::{self, GoalSource, Model, Outcome, StageTimes};
-use std::time::Duration;
+use recording::plans::{Exchange, Plans};
+use std::time::{Duration, Instant};
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
+use wire::replay::PlannedEpisode;
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
 use wire::{Code, Error, Image, Message, Observation, key, query};
 use zenoh::Session;
@@ -30,6 +32,8 @@ pub(crate) struct Attempt {
     pub(crate) goal: Image,
     /// Every frame from the first on, one more than steps.
     pub(crate) frames: Vec<Image>,
+    /// What the planner was asked, and its answers.
+    pub(crate) plans: Plans,
 }
 
 /// Why an attempt came to no end.
@@ -65,16 +69,17 @@ pub(crate) async fn attempt(
     goal: GoalSource,
 ) -> Result<Attempt, Fault> {
     let reset = link.reset(worker, variation, goal).await?;
-    let mut goal = match reset.goal_position {
+    let start = Instant::now();
+    let goal = match reset.goal_position {
         Some(position) => Goal::Position(position),
         None => Goal::Id(link.register_goal(&reset.goal).await?),
     };
     let step_key = key::sim_step(worker)?;
-    let mut log = Log::default();
+    let mut exchanges = Vec::new();
     let mut hand = reset.hand_position;
     let mut frames = vec![reset.observation];
     for step in 0..reset.max_steps {
-        let request = |goal: &Goal| PlanRequest {
+        let request = PlanRequest {
             seed: plan_seed(variation.seed, step),
             deadline: Some(link.timeout),
             // The one that the run began with, though the planner may swap.
@@ -85,21 +90,31 @@ pub(crate) async fn attempt(
                 hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
             )
         };
-        let mut plan = link.plan(request(&goal)).await;
+        let asked = start.elapsed();
+        let mut plan = link.plan(request.clone()).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
             // The planner was restarted, or has evicted the goal.
-            goal = Goal::Id(link.register_goal(&reset.goal).await?);
-            plan = link.plan(request(&goal)).await;
+            link.register_goal(&reset.goal).await?;
+            plan = link.plan(request.clone()).await;
         }
-        let plan = plan?;
-        log.add(&plan);
-        let request = StepRequest { episode_id: reset.episode_id.clone(), step, action: plan.first_action };
+        let response = plan?;
+        let action = response.first_action.clone();
+        exchanges.push(Exchange { request, asked, response, answered: start.elapsed() });
+        let request = StepRequest { episode_id: reset.episode_id.clone(), step, action };
         let response: StepResponse = link.call(step_key.clone(), request).await?;
         hand = response.hand_position;
         frames.push(response.observation);
         if response.done {
             let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
-            return Ok(Attempt { outcome, episode: log.finish(plan.goal_id), goal: reset.goal, frames });
+            let episode = PlannedEpisode {
+                variation: variation.clone(),
+                model: model.name.clone(),
+                model_digest: model.digest.clone(),
+                goal: reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from),
+                plans: step + 1,
+            };
+            let plans = Plans::new(episode, exchanges)?;
+            return Ok(Attempt { outcome, episode: course(&plans), goal: reset.goal, frames, plans });
         }
     }
     let expected = format!("true after {} steps", reset.max_steps);
@@ -144,44 +159,26 @@ impl Link {
     }
 }
 
-/// What the plans of an episode told about themselves.
-#[derive(Debug, Default)]
-struct Log {
-    steps: u32,
-    latent_distances: Vec<Option<f32>>,
-    first_inner_losses: Vec<Option<f32>>,
-    last_inner_losses: Vec<Option<f32>>,
-    times: StageTimes,
-}
-
-impl Log {
-    fn add(&mut self, plan: &PlanResponse) {
-        let finite = |value: f32| value.is_finite().then_some(value);
-        self.last_inner_losses = plan.inner_losses.iter().map(|&loss| finite(loss)).collect();
-        if self.steps == 0 {
-            self.first_inner_losses.clone_from(&self.last_inner_losses);
-        }
-        self.latent_distances.extend(plan.latent_distance.map(finite));
-        self.times.queue_seconds += plan.times.queue_seconds;
-        self.times.encode_seconds += plan.times.encode_seconds;
-        self.times.plan_seconds += plan.times.plan_seconds;
-        self.steps += 1;
-    }
-
-    fn finish(self, goal_id: String) -> record::Episode {
-        let mean = |sum: f64| sum / f64::from(self.steps);
-        record::Episode {
-            goal_id,
-            steps: self.steps,
-            latent_distances: self.latent_distances,
-            first_inner_losses: self.first_inner_losses,
-            last_inner_losses: self.last_inner_losses,
-            mean_times: StageTimes {
-                queue_seconds: mean(self.times.queue_seconds),
-                encode_seconds: mean(self.times.encode_seconds),
-                plan_seconds: mean(self.times.plan_seconds),
-            },
-        }
+/// What the plans of an episode tell about themselves.
+fn course(plans: &Plans) -> record::Episode {
+    let plans: Vec<_> = plans.exchanges().iter().map(|exchange| &exchange.response).collect();
+    let finite = |value: f32| value.is_finite().then_some(value);
+    let inner_losses = |plan: Option<&&PlanResponse>| {
+        plan.iter().flat_map(|plan| &plan.inner_losses).map(|&loss| finite(loss)).collect()
+    };
+    let mean =
+        |seconds: fn(&PlanResponse) -> f64| plans.iter().map(|plan| seconds(plan)).sum::<f64>() / plans.len() as f64;
+    record::Episode {
+        goal_id: plans.last().map(|plan| plan.goal_id.clone()).unwrap_or_default(),
+        steps: plans.len() as u32,
+        latent_distances: plans.iter().filter_map(|plan| plan.latent_distance).map(finite).collect(),
+        first_inner_losses: inner_losses(plans.first()),
+        last_inner_losses: inner_losses(plans.last()),
+        mean_times: StageTimes {
+            queue_seconds: mean(|plan| plan.times.queue_seconds),
+            encode_seconds: mean(|plan| plan.times.encode_seconds),
+            plan_seconds: mean(|plan| plan.times.plan_seconds),
+        },
     }
 }
 
@@ -284,6 +281,8 @@ mod tests {
         let attempt = attempt(&link, "w", &model(DIGEST), &variation("reach", 1), goal).await.unwrap();
         assert_eq!(registered.load(Ordering::SeqCst), 2);
         assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
+        let plans = attempt.plans;
+        assert_eq!((plans.exchanges().len(), &plans.episode().goal), (3, &image(255).into()));
         let episode = attempt.episode;
         assert_eq!((episode.steps, episode.latent_distances), (3, vec![Some(1.0); 3]));
         let seeds = [1 << 16, (1 << 16) + 2].map(|seed| seed as f32);

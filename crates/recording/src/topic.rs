@@ -22,16 +22,22 @@ pub(crate) enum Topic {
     Camera,
     /// `cpn.v1.RecordedStep`.
     Step,
+    /// `cpn.v1.PlannedEpisode`, first and once.
+    PlannedEpisode,
+    /// `cpn.v1.PlanRequest`.
+    PlanRequest,
+    /// `cpn.v1.PlanResponse`, after its request.
+    PlanResponse,
 }
 
 impl Topic {
-    pub(crate) const ALL: [Self; 3] = [Self::Episode, Self::Camera, Self::Step];
-
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Self::Episode => "/episode",
+            Self::Episode | Self::PlannedEpisode => "/episode",
             Self::Camera => "/camera",
             Self::Step => "/step",
+            Self::PlanRequest => "/plan/request",
+            Self::PlanResponse => "/plan/response",
         }
     }
 
@@ -41,6 +47,9 @@ impl Topic {
             Self::Episode => proto::RecordedEpisode::full_name(),
             Self::Camera => schema_of_camera().name,
             Self::Step => proto::RecordedStep::full_name(),
+            Self::PlannedEpisode => proto::PlannedEpisode::full_name(),
+            Self::PlanRequest => proto::PlanRequest::full_name(),
+            Self::PlanResponse => proto::PlanResponse::full_name(),
         }
     }
 
@@ -48,7 +57,9 @@ impl Topic {
     pub(crate) fn schema(self) -> Vec<u8> {
         match self {
             Self::Camera => schema_of_camera().data.into_owned(),
-            Self::Episode | Self::Step => schema_of_recordings(),
+            Self::Episode | Self::Step => schema_of("cpn/v1/demonstration.proto"),
+            Self::PlannedEpisode => schema_of("cpn/v1/replay.proto"),
+            Self::PlanRequest | Self::PlanResponse => schema_of("cpn/v1/planner.proto"),
         }
     }
 }
@@ -57,10 +68,10 @@ fn schema_of_camera() -> foxglove::Schema {
     RawImage::get_schema().expect("every message of Foxglove has a schema")
 }
 
-/// The two files that recordings need, so that a change of any other leaves recordings as they are.
-fn schema_of_recordings() -> Vec<u8> {
+/// A file and the types it refers to, and no other, so that a change of any other leaves recordings as they are.
+fn schema_of(file_name: &str) -> Vec<u8> {
     let mut all = FileDescriptorSet::decode(proto::DESCRIPTORS).expect("the build script encoded them");
-    all.file.retain(|file| matches!(file.name(), "cpn/v1/types.proto" | "cpn/v1/demonstration.proto"));
+    all.file.retain(|file| ["cpn/v1/types.proto", file_name].contains(&file.name()));
     all.encode_to_vec()
 }
 

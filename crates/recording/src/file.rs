@@ -1,0 +1,151 @@
+//! MCAP files of protobuf messages: written in one go, and read as a stranger's.
+
+use crate::MAX_BYTES;
+use crate::topic::{ENCODING, Topic};
+use mcap::io::MessageReader;
+use mcap::records::MessageHeader;
+use mcap::sans_io::LinearReaderOptions;
+use mcap::{McapError, Message, WriteOptions};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Cursor, Read};
+use std::path::Path;
+use wire::Error;
+
+/// Frames compress against those before them in the same chunk, so that a chunk holds a whole episode of usual length.
+const CHUNK_BYTES: u64 = 4 << 20;
+
+/// Why a recording was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The file could not be read.
+    #[error("recording: {0}")]
+    Io(#[from] std::io::Error),
+    /// Not a whole and undamaged MCAP file.
+    #[error("recording: {}", reason(.0))]
+    Mcap(#[from] McapError),
+    /// Undamaged, but not the recording that is expected.
+    #[error("recording: {0}")]
+    Content(#[from] Error),
+}
+
+/// The error with what caused it, which MCAP's own message leaves out.
+fn reason(error: &McapError) -> String {
+    match error {
+        McapError::Parse(cause) => format!("{error}: {cause}"),
+        McapError::Io(cause) => format!("{error}: {cause}"),
+        _ => error.to_string(),
+    }
+}
+
+/// A file that is being written. The same messages give the same bytes.
+pub(crate) struct Writer {
+    writer: mcap::Writer<Cursor<Vec<u8>>>,
+    channels: Vec<(Topic, u16)>,
+}
+
+impl Writer {
+    pub(crate) fn new(topics: &[Topic]) -> Result<Self, McapError> {
+        let options = WriteOptions::new()
+            .library("cpn")
+            .chunk_size(Some(CHUNK_BYTES))
+            // Threads would only change how the time is spent, and one file takes little.
+            .compression_threads(0);
+        let mut writer = options.create(Cursor::new(Vec::new()))?;
+        let channels = topics.iter().map(|&topic| {
+            let schema = writer.add_schema(&topic.schema_name(), ENCODING, &topic.schema())?;
+            Ok((topic, writer.add_channel(schema, topic.name(), ENCODING, &BTreeMap::new())?))
+        });
+        let channels = channels.collect::<Result<_, McapError>>()?;
+        Ok(Self { writer, channels })
+    }
+
+    /// Adds a message at one of the topics; `time` is in nanoseconds since the start of the episode.
+    pub(crate) fn write(
+        &mut self,
+        topic: Topic,
+        sequence: u32,
+        time: u64,
+        message: &impl prost::Message,
+    ) -> Result<(), McapError> {
+        let channel = self.channels.iter().find(|(known, _)| *known == topic);
+        let channel_id = channel.expect("a topic that the file was begun with").1;
+        let header = MessageHeader { channel_id, sequence, log_time: time, publish_time: time };
+        self.writer.write_to_known_channel(&header, &message.encode_to_vec())
+    }
+
+    /// Lets what follows begin a chunk.
+    pub(crate) fn end_chunk(&mut self) -> Result<(), McapError> {
+        self.writer.flush()
+    }
+
+    pub(crate) fn finish(mut self) -> Result<Vec<u8>, McapError> {
+        self.writer.finish()?;
+        Ok(self.writer.into_inner().into_inner())
+    }
+}
+
+/// The bytes of a file, if there are not too many.
+pub(crate) fn bytes(path: &Path) -> Result<Vec<u8>, ReadError> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+    check_size(bytes.len())?;
+    Ok(bytes)
+}
+
+/// The messages of a file, checked and bounded.
+pub(crate) struct Reader<R> {
+    reader: MessageReader<R>,
+    bytes: usize,
+}
+
+impl<R: Read> Reader<R> {
+    pub(crate) fn new(source: R) -> Self {
+        let options = LinearReaderOptions::default()
+            .with_check_finishes_after_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            .with_record_length_limit(MAX_BYTES);
+        Self { reader: MessageReader::new_with_options(source, options), bytes: 0 }
+    }
+
+    fn next(&mut self) -> Result<Option<Message<'static>>, ReadError> {
+        let Some(message) = self.reader.next().transpose()? else { return Ok(None) };
+        self.bytes += message.data.len();
+        check_size(self.bytes)?;
+        Ok(Some(message))
+    }
+
+    /// The next message, which must be of this topic and its schema.
+    pub(crate) fn of(&mut self, topic: Topic) -> Result<Message<'static>, ReadError> {
+        let name = topic.name();
+        let message = self.next()?.ok_or_else(|| Error::invalid(name, "a message", "the end of the file"))?;
+        let (channel, schema) = (&message.channel, message.channel.schema.as_ref());
+        check("topic", name, &channel.topic)?;
+        let expected = format!("{} as {ENCODING}", topic.schema_name());
+        let got = schema.map_or("none".to_owned(), |schema| format!("{} as {}", schema.name, schema.encoding));
+        check(&format!("{name}.schema"), &expected, &got)?;
+        check(&format!("{name}.encoding"), ENCODING, &channel.message_encoding)?;
+        Ok(message)
+    }
+
+    /// Reads to the end of the file, where its last checksums are: nothing may follow the last step of `field`.
+    pub(crate) fn end(&mut self, field: &str, last: u32) -> Result<(), ReadError> {
+        match self.next()? {
+            None => Ok(()),
+            Some(extra) => {
+                let expected = format!("no message after step {last}");
+                Err(Error::invalid(field, expected, extra.channel.topic.clone()).into())
+            }
+        }
+    }
+}
+
+pub(crate) fn check(field: &str, expected: &str, got: &str) -> Result<(), Error> {
+    if expected == got { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
+}
+
+pub(crate) fn check_size(bytes: usize) -> Result<(), Error> {
+    if bytes <= MAX_BYTES { Ok(()) } else { Err(Error::invalid("size", format!("at most {MAX_BYTES} bytes"), bytes)) }
+}
