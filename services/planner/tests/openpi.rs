@@ -4,13 +4,14 @@
 
 mod common;
 
-use common::{Fixture, Gate, PATIENCE, checkpoint, image, plan_request, position_checkpoint, position_request, soon};
-use cpn::{Input, Method, MethodKind, Plan, Random};
+use common::{
+    Fixture, Gate, PATIENCE, checkpoint, image, method, plan_request, position_checkpoint, position_request, soon,
+};
+use cpn::{Method, MethodKind, Plan};
 use futures::{SinkExt, StreamExt};
 use planner::model::RANDOM;
 use rmpv::Value;
 use std::net::SocketAddr;
-use tch::Tensor;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
@@ -130,29 +131,9 @@ fn assert_same(answer: &Value, plan: &PlanResponse) {
 }
 
 /// A method whose actions are out of bounds.
-struct Far;
-
-impl Method for Far {
-    fn name(&self) -> &'static str {
-        "random"
-    }
-
-    fn horizon(&self) -> i64 {
-        2
-    }
-
-    fn takes(&self, _: Input) -> bool {
-        true
-    }
-
-    fn encode(&self, images: &Tensor) -> Tensor {
-        Random { actions: 4 }.encode(images)
-    }
-
-    fn plan(&self, _: &Tensor, _: &Tensor, _: u64) -> Plan {
-        let actions = Tensor::from_slice(&[0.5_f32, -0.5, 7.0, -7.0]).repeat([2]).view([1, 2, 4]);
-        Plan { actions, inner_losses: Vec::new() }
-    }
+fn far() -> Box<dyn Method> {
+    let plan = || Plan { actions: vec![vec![0.5, -0.5, 7.0, -7.0]; 2], inner_losses: Vec::new(), iterations: 0 };
+    method(move |queries| queries.iter().map(|_| plan()).collect())
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -160,7 +141,7 @@ async fn openpi_gets_the_answers_of_the_core() {
     let mut checkpoints: Vec<_> = MethodKind::ALL.map(|method| (method.name(), checkpoint(method, 1))).into();
     checkpoints.push(("jenga", position_checkpoint(1)));
     let fixture = start(&checkpoints).await;
-    common::serve(&fixture.planner.core(), "far", Box::new(Far)).await;
+    common::serve(&fixture.planner.core(), "far", far()).await;
     let [core, ..] = fixture.clients();
     let mut client = Client::of(&fixture).await;
 

@@ -4,9 +4,7 @@
 
 mod common;
 
-use common::{Client, Faulty, Fixture, Gate, image, is, plan_request, soon};
-use cpn::method::{Observed, Query, Search};
-use cpn::{Input, Method, Plan, Random};
+use common::{Client, Fixture, Gate, faulty, image, is, method, plan_request, random, soon};
 use futures::future::join_all;
 use planner::core::PlannerCore;
 use planner::model::RANDOM;
@@ -134,7 +132,7 @@ async fn clients_that_give_up_do_not_disturb() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_failing_plan_fails_alone() {
     let fixture = Fixture::start(&[], |_| ()).await;
-    common::serve(&fixture.planner.core(), "faulty", Box::new(Faulty)).await;
+    common::serve(&fixture.planner.core(), "faulty", faulty()).await;
     for client in fixture.clients() {
         is(Code::Internal, "actions", client.plan(plan_request("faulty", 2)).await);
         is(Code::Internal, "plan", client.plan(plan_request("faulty", 3)).await);
@@ -142,45 +140,15 @@ async fn a_failing_plan_fails_alone() {
     }
 }
 
-/// A method that says how many plans it is asked for at once, and waits like a [`Gate`]'s for the first of them.
-struct Counting(mpsc::Sender<usize>);
-
-impl Method for Counting {
-    fn name(&self) -> &'static str {
-        "random"
-    }
-
-    fn horizon(&self) -> usize {
-        1
-    }
-
-    fn actions(&self) -> usize {
-        4
-    }
-
-    fn updates(&self) -> Option<usize> {
-        None
-    }
-
-    fn takes(&self, _: Input) -> bool {
-        true
-    }
-
-    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
-        Random { actions: 4 }.encode(inputs)
-    }
-
-    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
-        self.0.send(queries.len()).unwrap();
-        Random { actions: 4 }.plan(queries, search)
-    }
-}
-
 /// Puts requests in the queue while the model is busy, lets it on, and answers how many were planned at once.
 async fn planned_together(fixture: &Fixture, requests: Vec<proto::PlanRequest>) -> (Vec<usize>, Vec<PlanResponse>) {
     let core = fixture.planner.core();
     let (sender, counts) = mpsc::channel();
-    common::serve(&core, "counting", Box::new(Counting(sender))).await;
+    let counting = method(move |queries| {
+        sender.send(queries.len()).unwrap();
+        random(queries)
+    });
+    common::serve(&core, "counting", counting).await;
     let gate = Gate::serve(&core).await;
     let running = enqueue(&core, plan_request("gated", 1)).await;
     assert_eq!(gate.entered().await, 1);
@@ -213,7 +181,7 @@ async fn what_waits_is_planned_together() {
 async fn a_batch_fails_one_by_one() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
-    common::serve(&core, "faulty", Box::new(Faulty)).await;
+    common::serve(&core, "faulty", faulty()).await;
     let gate = Gate::serve(&core).await;
     let running = enqueue(&core, plan_request("gated", 1)).await;
     assert_eq!(gate.entered().await, 1);

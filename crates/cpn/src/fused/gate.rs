@@ -87,7 +87,9 @@ impl<T: Real> Gate<T> {
     pub fn backward(&self, rows: usize, s_bar: &[T], tape: &mut GateTape<T>, x_bar: &mut [T]) {
         let size = rows * tape.width;
         let h_bar = &mut tape.h_adjoint[size..2 * size];
-        self.output.backward_rectified(s_bar, &tape.h[..size], h_bar);
+        h_bar.fill(T::ZERO);
+        self.output.backward(s_bar, h_bar);
+        mask(h_bar, &tape.h[..size]);
         self.hidden.backward(h_bar, x_bar);
     }
 
@@ -112,7 +114,9 @@ impl<T: Real> Gate<T> {
         let (size, stacked) = (rows * tape.width, s.len() / tape.outputs * tape.width);
         self.output.accumulate(rows, (&tape.h[..stacked], s), &mut gradient.output);
         let h_hat = &mut tape.h_adjoint[..size];
-        self.output.backward_rectified(&s[..rows * tape.outputs], &tape.h[..size], h_hat);
+        h_hat.fill(T::ZERO);
+        self.output.backward(&s[..rows * tape.outputs], h_hat);
+        mask(h_hat, &tape.h[..size]);
         self.hidden.backward(h_hat, x_hat);
         self.hidden.accumulate(rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
     }

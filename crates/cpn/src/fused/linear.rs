@@ -1,8 +1,7 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
-use super::gate::mask;
 use super::lanes::Lanes;
-use super::matrix::{Matrix, Panels, accumulate_turned, multiply, multiply_back};
+use super::matrix::{Matrix, Panels, accumulate_turned, multiply};
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
 
@@ -72,14 +71,6 @@ impl<T: Real> Linear<T> {
     /// x̄ += aᵀ ȳ: how a loss changes with x, from how it changes with y.
     pub fn backward(&self, y_bar: &[T], x_bar: &mut [T]) {
         multiply(true, x_bar, y_bar, Matrix::new(&self.weight, self.inputs));
-    }
-
-    /// The same through a rectified linear unit that left x: x̄ = aᵀ ȳ where x is positive, else 0. For many outputs of a few
-    /// inputs, whose weights are read where the forward pass reads them.
-    pub fn backward_rectified(&self, y_bar: &[T], x: &[T], x_bar: &mut [T]) {
-        x_bar.fill(T::ZERO);
-        multiply_back(x_bar, y_bar, self.transposed.matrix(), x);
-        mask(x_bar, x);
     }
 
     /// Adds ∂Φ/∂a and ∂Φ/∂b to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold the R rows of x and ŷ and, in the second

@@ -76,12 +76,6 @@ pub fn accumulate_turned<T: Real>(c: &mut [T], a: &[T], b: Matrix<'_, T>) {
     Arch::new().dispatch(Product { accumulate: true, c, a, b, turned: true });
 }
 
-/// x += y bᵀ: y is `[rows, columns]`, x `[rows, inner]`. Of a single row only those numbers are computed that `wanted`,
-/// `[rows, inner]`, is positive at; the others stay.
-pub fn multiply_back<T: Real>(x: &mut [T], y: &[T], b: Matrix<'_, T>, wanted: &[T]) {
-    Arch::new().dispatch(Back { x, y, b, wanted });
-}
-
 /// How wide panels are on this processor.
 fn width<T: Real>() -> usize {
     struct Width<T>(PhantomData<T>);
@@ -199,78 +193,4 @@ fn sums<S: Simd, T: Real, const R: usize, const P: usize>(
         (0..inner).for_each(add);
     }
     sums
-}
-
-#[derive(Debug)]
-struct Back<'a, T> {
-    x: &'a mut [T],
-    y: &'a [T],
-    b: Matrix<'a, T>,
-    wanted: &'a [T],
-}
-
-/// Rows, and numbers of each, that [`Back`] computes at once.
-const BLOCK: usize = 4;
-/// Numbers of a single row.
-const LINE: usize = 8;
-
-impl<T: Real> WithSimd for Back<'_, T> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(mut self, simd: S) {
-        let Matrix { inner, columns, .. } = self.b;
-        let rows = self.x.len() / inner;
-        assert!(self.x.len() == rows * inner && self.y.len() == rows * columns, "shapes of a product");
-        let (whole, even) = (rows - rows % BLOCK, inner - inner % BLOCK);
-        for row in (0..whole).step_by(BLOCK) {
-            for k in (0..even).step_by(BLOCK) {
-                self.tile::<S, BLOCK, BLOCK>(simd, row, std::array::from_fn(|i| k + i));
-            }
-            for k in even..inner {
-                self.tile::<S, BLOCK, 1>(simd, row, [k]);
-            }
-        }
-        for row in whole..rows {
-            for start in (0..inner).step_by(CHUNK) {
-                let (mut places, mut count) = ([0; CHUNK], 0);
-                for k in start..inner.min(start + CHUNK) {
-                    places[count] = k;
-                    count += usize::from(self.wanted[row * inner + k] > T::ZERO);
-                }
-                let (groups, rest) = places[..count].as_chunks::<LINE>();
-                groups.iter().for_each(|places| self.tile::<S, 1, LINE>(simd, row, *places));
-                rest.iter().for_each(|place| self.tile::<S, 1, 1>(simd, row, [*place]));
-            }
-        }
-    }
-}
-
-impl<T: Real> Back<'_, T> {
-    /// Numbers of R rows of x, from `row` on, at K places: sums in every lane along a line of b, then over the lanes.
-    #[inline(always)]
-    fn tile<S: Simd, const R: usize, const K: usize>(&mut self, simd: S, row: usize, places: [usize; K]) {
-        let Matrix { inner, columns, stride, apart, values } = self.b;
-        let count = Lanes::<S, T>::COUNT;
-        let y: [&[T]; R] = std::array::from_fn(|r| &self.y[(row + r) * columns..][..columns]);
-        let mut sums = [[Lanes::splat(simd, T::ZERO); K]; R];
-        for panel in 0..columns.div_ceil(REGISTERS * count) {
-            let b = places.map(|k| &values[panel * apart + k * stride..][..REGISTERS * count]);
-            for i in 0..REGISTERS {
-                let from = (panel * REGISTERS + i) * count;
-                let b = b.map(|line| Lanes::load(simd, &line[i * count..]));
-                for (sums, y) in sums.iter_mut().zip(y) {
-                    let y = Lanes::load(simd, y.get(from..).unwrap_or_default());
-                    for (sum, b) in sums.iter_mut().zip(b) {
-                        *sum = y.mul_add(b, *sum);
-                    }
-                }
-            }
-        }
-        for (r, sums) in sums.into_iter().enumerate() {
-            for (k, sum) in places.into_iter().zip(sums) {
-                self.x[(row + r) * inner + k] += sum.sum();
-            }
-        }
-    }
 }

@@ -5,7 +5,7 @@
 
 use cpn::checkpoint::{self, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig};
-use cpn::method::{Observed, Query, Search};
+use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::{Agent, EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
 use planner::model::Model;
@@ -258,84 +258,19 @@ pub fn position_request(model: &str) -> proto::PlanRequest {
     }
 }
 
-/// A method that says which seed it plans for and then waits to be let on.
-pub struct Gated {
-    entered: mpsc::Sender<u64>,
-    gate: mpsc::Receiver<()>,
+/// A method of 4 actions a plan, by a function of a test.
+pub fn method(plan: impl FnMut(&[Query<'_>]) -> Vec<Plan> + Send + 'static) -> Box<dyn Method> {
+    Box::new(Stub(plan))
 }
 
-/// The test's side of a [`Gated`] method.
-pub struct Gate {
-    entered: mpsc::Receiver<u64>,
-    gate: mpsc::Sender<()>,
+/// What [`Random`] plans.
+pub fn random(queries: &[Query<'_>]) -> Vec<Plan> {
+    Random { actions: 4 }.plan(queries, &mut Search { solver: Solver::Gradient, iterations: Iterations::Fixed(0) })
 }
 
-impl Gate {
-    /// Serves a gated method under the name `gated`.
-    pub async fn serve(core: &PlannerCore) -> Self {
-        let (sender, entered) = mpsc::channel();
-        let (gate, receiver) = mpsc::channel();
-        serve(core, "gated", Box::new(Gated { entered: sender, gate: receiver })).await;
-        Self { entered, gate }
-    }
+struct Stub<F>(F);
 
-    /// Waits until a plan is being made; answers its seed.
-    pub async fn entered(&self) -> u64 {
-        let arrival = async {
-            loop {
-                match self.entered.try_recv() {
-                    Ok(seed) => return seed,
-                    Err(_) => tokio::time::sleep(Duration::from_millis(1)).await,
-                }
-            }
-        };
-        soon(arrival).await
-    }
-
-    /// Lets one plan on.
-    pub fn open(&self) {
-        self.gate.send(()).unwrap();
-    }
-}
-
-impl Method for Gated {
-    fn name(&self) -> &'static str {
-        "random"
-    }
-
-    fn horizon(&self) -> usize {
-        1
-    }
-
-    fn actions(&self) -> usize {
-        4
-    }
-
-    fn updates(&self) -> Option<usize> {
-        None
-    }
-
-    fn takes(&self, _: Input) -> bool {
-        true
-    }
-
-    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
-        Random { actions: 4 }.encode(inputs)
-    }
-
-    fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
-        for query in queries {
-            self.entered.send(query.seed).unwrap();
-            self.gate.recv_timeout(PATIENCE).unwrap();
-        }
-        Random { actions: 4 }.plan(queries, search)
-    }
-}
-
-/// A method that fails: on even seeds its actions are not numbers, on odd ones it panics.
-pub struct Faulty;
-
-impl Method for Faulty {
+impl<F: FnMut(&[Query<'_>]) -> Vec<Plan> + Send> Method for Stub<F> {
     fn name(&self) -> &'static str {
         "random"
     }
@@ -361,12 +296,58 @@ impl Method for Faulty {
     }
 
     fn plan(&mut self, queries: &[Query<'_>], _: &mut Search<'_>) -> Vec<Plan> {
-        let plan = |query: &Query<'_>| {
-            assert!(query.seed.is_multiple_of(2), "an odd seed");
-            Plan { actions: vec![vec![f32::NAN; 4]], inner_losses: Vec::new(), iterations: 0 }
-        };
-        queries.iter().map(plan).collect()
+        (self.0)(queries)
     }
+}
+
+/// The test's side of a method that says which seed it plans for, and then waits to be let on.
+pub struct Gate {
+    entered: mpsc::Receiver<u64>,
+    gate: mpsc::Sender<()>,
+}
+
+impl Gate {
+    /// Serves a gated method under the name `gated`.
+    pub async fn serve(core: &PlannerCore) -> Self {
+        let (sender, entered) = mpsc::channel();
+        let (gate, receiver) = mpsc::channel();
+        let gated = method(move |queries| {
+            for query in queries {
+                sender.send(query.seed).unwrap();
+                receiver.recv_timeout(PATIENCE).unwrap();
+            }
+            random(queries)
+        });
+        serve(core, "gated", gated).await;
+        Self { entered, gate }
+    }
+
+    /// Waits until a plan is being made; answers its seed.
+    pub async fn entered(&self) -> u64 {
+        let arrival = async {
+            loop {
+                match self.entered.try_recv() {
+                    Ok(seed) => return seed,
+                    Err(_) => tokio::time::sleep(Duration::from_millis(1)).await,
+                }
+            }
+        };
+        soon(arrival).await
+    }
+
+    /// Lets one plan on.
+    pub fn open(&self) {
+        self.gate.send(()).unwrap();
+    }
+}
+
+/// A method that fails: on even seeds its actions are not numbers, on odd ones it panics.
+pub fn faulty() -> Box<dyn Method> {
+    let plan = |query: &Query<'_>| {
+        assert!(query.seed.is_multiple_of(2), "an odd seed");
+        Plan { actions: vec![vec![f32::NAN; 4]], inner_losses: Vec::new(), iterations: 0 }
+    };
+    method(move |queries| queries.iter().map(plan).collect())
 }
 
 pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
