@@ -74,25 +74,18 @@ impl Owner {
         }
     }
 
-    /// What can be planned with the first: the tasks of its kind behind it, up to the next swap, as long as none would be late
-    /// for the others' sake.
+    /// What can be planned with the first: the tasks like it that wait, up to the next swap, as long as none would be late for
+    /// the others' sake.
     fn gather(&mut self, first: Waiting, jobs: &mpsc::Receiver<Job>) -> Vec<Waiting> {
-        let (kind, mut due) = (first.task.kind(), first.due());
         let most = if first.task.is_anytime() { 1 } else { self.batch_size };
-        let until = Instant::now() + self.batch_delay;
-        let more = || {
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() { jobs.try_recv().ok() } else { jobs.recv_timeout(left).ok() }
-        };
-        while let Some(job) = (self.queue.len() + 1 < most).then(more).flatten() {
-            self.queue.push_back(job);
-        }
+        self.listen(&first.task, most, jobs);
         let swap = self.queue.iter().position(|job| !matches!(job, Job::Plan(_))).unwrap_or(self.queue.len());
         let after = self.queue.split_off(swap);
+        let mut due = first.due();
         let (mut batch, mut rest) = (vec![first], VecDeque::new());
         for job in self.queue.drain(..) {
             match job {
-                Job::Plan(waiting) if batch.len() < most && waiting.task.kind() == kind => {
+                Job::Plan(waiting) if batch.len() < most && waiting.task.is_like(&batch[0].task) => {
                     let earliest = due.into_iter().chain(waiting.due()).min();
                     if earliest.is_none_or(|due| Instant::now() + self.load.time(batch.len() + 1) <= due) {
                         due = earliest;
@@ -107,6 +100,19 @@ impl Owner {
         rest.extend(after);
         self.queue = rest;
         batch
+    }
+
+    /// Takes all that has come into the queue and, if the delay allows, waits for what makes the batch full.
+    fn listen(&mut self, first: &PlanTask, most: usize, jobs: &mpsc::Receiver<Job>) {
+        let until = Instant::now() + self.batch_delay;
+        self.queue.extend(jobs.try_iter());
+        let is_like_first = |job: &&Job| matches!(job, Job::Plan(waiting) if waiting.task.is_like(first));
+        while self.queue.iter().filter(is_like_first).count() + 1 < most {
+            match jobs.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                Ok(job) => self.queue.push_back(job),
+                Err(_) => return,
+            }
+        }
     }
 
     /// Answers tasks of one kind, whatever happens: a fault of one ends neither the thread nor the others' plans.

@@ -39,20 +39,11 @@ pub(crate) struct Waiting {
     pub(crate) reply: oneshot::Sender<Result<PlanResponse, Error>>,
 }
 
-/// Tasks of one kind can be planned together.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Kind {
-    pub(crate) model: String,
-    pub(crate) model_digest: Option<String>,
-    pub(crate) search: Option<Search>,
-    pub(crate) is_warm: bool,
-}
-
 impl PlanTask {
-    pub(crate) fn kind(&self) -> Kind {
-        let Self { model, model_digest, search, warm_start, .. } = self;
-        let (model, model_digest) = (model.clone(), model_digest.clone());
-        Kind { model, model_digest, search: *search, is_warm: !warm_start.is_empty() }
+    /// Whether both can be planned together.
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
+        let kind = |task: &Self| (task.search, task.warm_start.is_empty());
+        self.model == other.model && self.model_digest == other.model_digest && kind(self) == kind(other)
     }
 
     /// Whether the plan goes on until its own deadline, so that nobody can share it.
