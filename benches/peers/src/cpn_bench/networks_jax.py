@@ -73,16 +73,30 @@ def rollout(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Arra
     return jnp.stack(actions, 1)
 
 
-def inner_loss(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
-    """Huber between the state predicted after the actions and the goal, summed: plans are independent."""
+def inner_losses(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
+    """Huber between the state predicted after each plan's actions and its goal, `[B]`."""
     for step in range(model.horizon):
         x = next_state(weights, x, features(weights, model, x, goal), actions[:, step])
-    return optax.losses.huber_loss(x, goal).sum()
+    return optax.losses.huber_loss(x, goal).sum(1)
 
 
-def plan(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
-    """The rollout, improved by gradient descent on the predicted distance to the goal."""
-    actions = rollout(weights, model, x, goal)
+def inner_loss(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, Array]:
+    """The sum, whose gradient is each plan's own, for plans are independent; and the losses."""
+    losses = inner_losses(actions, weights, model, x, goal)
+    return losses.sum(), losses
+
+
+def improve(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, list[Array]]:
+    """The rollout, improved by descent on the predicted distance to the goal; the losses before each update."""
+    actions, losses = rollout(weights, model, x, goal), []
     for _ in range(model.updates):
-        actions = actions - weights["step_size"] * jax.grad(inner_loss)(actions, weights, model, x, goal)
-    return actions
+        gradient, before = jax.grad(inner_loss, has_aux=True)(actions, weights, model, x, goal)
+        actions = actions - weights["step_size"] * gradient
+        losses.append(before)
+    return actions, losses
+
+
+def plan(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, Array]:
+    """Actions `[B, H, A]`, and the losses `[U + 1, B]` before each update and after the last."""
+    actions, losses = improve(weights, model, x, goal)
+    return actions, jnp.stack([*losses, inner_losses(actions, weights, model, x, goal)])

@@ -115,11 +115,15 @@ class Agent(nn.Module):
             actions.append(self.network.policy(features))
         return torch.stack(actions, 1)
 
-    def inner_loss(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
-        """Huber between the state predicted after the actions and the goal, summed: plans are independent."""
+    def inner_losses(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
+        """Huber between the state predicted after each plan's actions and its goal, `[B]`."""
         for action in actions.unbind(1):
             x = self.network.next(x, self.network.features(x, goal), action)
-        return F.huber_loss(x, goal, reduction="sum")
+        return F.huber_loss(x, goal, reduction="none").sum(1)
+
+    def inner_loss(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
+        """The sum, whose gradient is each plan's own: plans are independent."""
+        return self.inner_losses(actions, x, goal).sum()
 
 
 def tensors(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:

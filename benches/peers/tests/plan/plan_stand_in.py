@@ -57,7 +57,7 @@ def serve(data: PlanModel, batch: int, action_error: float) -> None:
     """Answers as ours does."""
     planner = Planner(data)
     observations, goals = data.frames[:batch], planner.embed(data.goals[:batch])
-    actions = planner.plan(observations, goals)[0] + action_error
+    actions = planner.plan(observations, goals)[0][0] + action_error
     print(json.dumps({"ready": True, "actions": actions.tolist()}), flush=True)
     for line in sys.stdin:
         if line == "stages\n":

@@ -2,35 +2,34 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 import plan_stand_in
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from cpn_bench.model import read
 from cpn_bench.plan import peer_jax, peer_onnx, peer_torch
+from cpn_bench.plan.contender import Plans
 from cpn_bench.plan.model import PlanModel
 
 GOLDEN = Path(__file__).resolve().parents[4] / "tests/golden"
 
 
-def by_torch(data: PlanModel) -> NDArray[Any]:
+def by_torch(data: PlanModel) -> Plans:
     planner = peer_torch.Planner(data)
     return planner.plan(data.frames, planner.embed(data.goals))
 
 
-def by_compiled_torch(data: PlanModel) -> NDArray[Any]:
+def by_compiled_torch(data: PlanModel) -> Plans:
     planner = peer_torch.Planner(data)
     # Traced as the peer is, without the minute that generated code takes.
     planner.plan_tensors = torch.compile(planner.traced, fullgraph=True, backend="aot_eager")
     return planner.plan(data.frames, planner.embed(data.goals))
 
 
-def by_jax(data: PlanModel) -> NDArray[Any]:
+def by_jax(data: PlanModel) -> Plans:
     with jax.enable_x64(True):
         planner = peer_jax.Planner(data)
         return planner.plan(data.frames, planner.embed(data.goals))
@@ -38,10 +37,11 @@ def by_jax(data: PlanModel) -> NDArray[Any]:
 
 @pytest.mark.parametrize("method", ["upn", "cpn"])
 @pytest.mark.parametrize("peer", [by_torch, by_compiled_torch, by_jax])
-def test_plans_are_golden(peer: Callable[[PlanModel], NDArray[Any]], method: str) -> None:
+def test_plans_are_golden(peer: Callable[[PlanModel], Plans], method: str) -> None:
     model, weights, tensors = read(GOLDEN / f"{method}.safetensors")
-    actions = peer(PlanModel(model, weights, tensors["observations"], tensors["goals"]))
+    actions, losses = peer(PlanModel(model, weights, tensors["observations"], tensors["goals"]))
     np.testing.assert_allclose(actions, tensors["actions"], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(losses, tensors["inner_losses"], rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.parametrize("method", ["upn", "cpn"])
@@ -52,7 +52,7 @@ def test_onnx_rolls_out_as_torch_does(tmp_path: Path, method: str) -> None:
     onnx = peer_onnx.Planner(data, batch, threads=1)
     planner = peer_torch.Planner(data)
     x, goals = planner.embed(data.frames[:batch]), planner.embed(data.goals[:batch])
-    rolled_out = onnx.plan(data.frames[:batch], onnx.embed(data.goals[:batch]))
+    rolled_out, _ = onnx.plan(data.frames[:batch], onnx.embed(data.goals[:batch]))
     np.testing.assert_allclose(rolled_out, planner.agent.rollout(x, goals).numpy(), rtol=1e-5, atol=1e-6)
 
 

@@ -7,6 +7,7 @@ use super::real::Real;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::images::{CHANNELS, SIZE};
 use crate::method::Observed;
+use pulp::{Arch, Simd, WithSimd};
 
 /// What layer normalisation adds to the variance, as libtorch does.
 const EPSILON: f64 = 1e-5;
@@ -22,16 +23,8 @@ pub struct Encoder<T> {
 /// From the input to features.
 #[derive(Debug)]
 enum Body<T> {
-    Image {
-        /// What each byte of an image becomes.
-        levels: Box<[T; 256]>,
-        convolutions: Vec<Convolution<T>>,
-    },
-    Position {
-        centre_metres: [f64; 3],
-        scale_metres: T,
-        layers: Vec<Linear<T>>,
-    },
+    Image { convolutions: Vec<Convolution<T>> },
+    Position { centre_metres: [f64; 3], scale_metres: T, layers: Vec<Linear<T>> },
 }
 
 /// A convolution over an image whose channels lie together, `[S, S, C]`, and a rectified linear unit.
@@ -103,9 +96,7 @@ impl<T: Real> Body<T> {
             convolutions.push(Convolution { kernel, stride, channels, weight, bias });
             channels = conv.channels as usize;
         }
-        let half = T::ONE / T::count(2);
-        let levels = Box::new(std::array::from_fn(|level| T::count(level) / T::count(255) - half));
-        (Self::Image { levels, convolutions }, channels)
+        (Self::Image { convolutions }, channels)
     }
 
     fn position(config: &PositionEncoderConfig, weights: &impl Weights<T>) -> Self {
@@ -121,8 +112,9 @@ impl<T: Real> Body<T> {
     fn features(&self, input: Observed<'_>, room: &mut Room<T>) {
         room.x.clear();
         match (self, input) {
-            (Self::Image { levels, convolutions }, Observed::Image(bytes)) => {
-                room.x.extend(bytes.iter().map(|byte| levels[usize::from(*byte)]));
+            (Self::Image { convolutions }, Observed::Image(bytes)) => {
+                room.x.resize(bytes.len(), T::ZERO);
+                Arch::new().dispatch(Scale { bytes, x: &mut room.x });
                 let mut side = SIZE as usize;
                 for convolution in convolutions {
                     side = convolution.forward(side, room);
@@ -162,6 +154,25 @@ impl<T: Real> Convolution<T> {
         multiply(true, y, patches, self.weight.matrix());
         rectify(y);
         size
+    }
+}
+
+/// Bytes as numbers from -1/2 to 1/2.
+struct Scale<'a, T> {
+    bytes: &'a [u8],
+    x: &'a mut [T],
+}
+
+impl<T: Real> WithSimd for Scale<'_, T> {
+    type Output = ();
+
+    // Nothing here names a register; the compiler finds them, as wide as the dispatch says there are.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let half = T::ONE / T::count(2);
+        for (x, byte) in self.x.iter_mut().zip(self.bytes) {
+            *x = T::from_u8(*byte) / T::count(255) - half;
+        }
     }
 }
 

@@ -32,6 +32,8 @@ pub trait Real:
 
     /// A count as a number.
     fn count(n: usize) -> Self;
+    /// A whole number.
+    fn from_u8(value: u8) -> Self;
     /// The nearest number.
     fn from_f64(value: f64) -> Self;
     /// The hyperbolic tangent.
@@ -72,6 +74,11 @@ macro_rules! real {
         #[inline(always)]
         fn count(n: usize) -> Self {
             n as Self
+        }
+
+        #[inline(always)]
+        fn from_u8(value: u8) -> Self {
+            Self::from(value)
         }
 
         #[inline(always)]

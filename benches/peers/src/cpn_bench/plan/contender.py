@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from cpn_bench.plan.model import PlanModel
 
 WARM_UP_BATCHES = 5
 Goals = TypeVar("Goals")
+Plans: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Actions `[B, H, A]`, and inner losses `[U + 1, B]` before each update and after the last."""
 
 
 class Contender(Protocol[Goals]):
@@ -22,8 +24,8 @@ class Contender(Protocol[Goals]):
         """Embeds goals `[B, 84, 84, 3]`, as the planner keeps them."""
         ...
 
-    def plan(self, observations: NDArray[np.uint8], goals: Goals) -> NDArray[np.float32]:
-        """Plans from observations `[B, 84, 84, 3]` to embedded goals; actions `[B, H, A]`."""
+    def plan(self, observations: NDArray[np.uint8], goals: Goals) -> Plans:
+        """Plans from observations `[B, 84, 84, 3]` to embedded goals."""
         ...
 
 
@@ -33,7 +35,7 @@ def serve(contender: Contender[Goals], data: PlanModel, batch: int) -> None:
     batches: Sequence[tuple[NDArray[np.uint8], Goals]] = [
         (data.frames[start : start + batch], contender.embed(data.goals[start : start + batch])) for start in starts
     ]
-    first = contender.plan(*batches[0])[0]
+    first = contender.plan(*batches[0])[0][0]
     for number in range(1, WARM_UP_BATCHES):
         contender.plan(*batches[number % len(batches)])
     print(json.dumps({"ready": True, "actions": first.tolist()}), flush=True)

@@ -41,7 +41,7 @@ class PlanAPI(litserve.LitAPI):
 
     def predict(self, x: NDArray[np.uint8], **kwargs: object) -> NDArray[np.float32]:
         """Plans for observations `[B, 84, 84, 3]`; actions `[B, H, A]`."""
-        return self.planner.plan(x, self.goal.expand(len(x), -1))
+        return self.planner.plan(x, self.goal.expand(len(x), -1))[0]
 
     def encode_response(self, output: NDArray[np.float32], **kwargs: object) -> dict[str, list[list[float]]]:
         """A plan."""

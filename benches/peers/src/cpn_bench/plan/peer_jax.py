@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cpn_bench import networks_jax
 from cpn_bench.harness import check_cores
-from cpn_bench.plan.contender import serve
+from cpn_bench.plan.contender import Plans, serve
 from cpn_bench.plan.model import PlanModel
 
 
@@ -28,7 +28,7 @@ class Planner:
         def encode(images: Array) -> Array:
             return networks_jax.encode(weights, model, images)
 
-        def plan(observations: Array, goals: Array) -> Array:
+        def plan(observations: Array, goals: Array) -> tuple[Array, Array]:
             return networks_jax.plan(weights, model, encode(observations), goals)
 
         self.encode, self.plan_arrays = jax.jit(encode), jax.jit(plan)
@@ -37,9 +37,10 @@ class Planner:
         """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
         return self.encode(goals)
 
-    def plan(self, observations: NDArray[np.uint8], goals: Array) -> NDArray[np.float32]:
-        """Plans from observations `[B, 84, 84, 3]` to goals `[B, Z]`; actions `[B, H, A]`."""
-        return np.asarray(self.plan_arrays(observations, goals))
+    def plan(self, observations: NDArray[np.uint8], goals: Array) -> Plans:
+        """Plans from observations `[B, 84, 84, 3]` to goals `[B, Z]`."""
+        actions, losses = self.plan_arrays(observations, goals)
+        return np.asarray(actions), np.asarray(losses)
 
 
 def main(model: Path, batch: int, threads: int) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cpn_bench.networks_torch import Agent, tensors
-from cpn_bench.plan.contender import serve
+from cpn_bench.plan.contender import Plans, serve
 from cpn_bench.plan.model import PlanModel
 
 
@@ -50,10 +50,10 @@ class Planner:
         """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
         return self.agent.encoder(torch.from_numpy(goals)).numpy()
 
-    def plan(self, observations: NDArray[np.uint8], goals: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The rollout from observations `[B, 84, 84, 3]` to goals `[B, Z]`; actions `[B, H, A]`."""
+    def plan(self, observations: NDArray[np.uint8], goals: NDArray[np.float32]) -> Plans:
+        """The rollout from observations `[B, 84, 84, 3]` to goals `[B, Z]`, without losses."""
         (actions,) = self.session.run(None, {"observations": observations, "goals": goals})
-        return np.asarray(actions)
+        return np.asarray(actions), np.empty((0, len(observations)), np.float32)
 
 
 def main(model: Path, batch: int, threads: int) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cpn_bench.networks_torch import Agent, tensors
-from cpn_bench.plan.contender import serve
+from cpn_bench.plan.contender import Plans, serve
 from cpn_bench.plan.model import PlanModel
 
 
@@ -35,28 +35,38 @@ class Planner:
         return self.agent.encoder(torch.from_numpy(goals))
 
     @torch.no_grad()
-    def plan(self, observations: NDArray[np.uint8], goals: Tensor) -> NDArray[np.float32]:
-        """Plans from observations `[B, 84, 84, 3]` to goals `[B, Z]`; actions `[B, H, A]`."""
-        return self.plan_tensors(torch.from_numpy(observations), goals).numpy()
+    def plan(self, observations: NDArray[np.uint8], goals: Tensor) -> Plans:
+        """Plans from observations `[B, 84, 84, 3]` to goals `[B, Z]`."""
+        actions, losses = self.plan_tensors(torch.from_numpy(observations), goals)
+        return actions.numpy(), losses.numpy()
 
-    def eager(self, observations: Tensor, goals: Tensor) -> Tensor:
+    def eager(self, observations: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
         """Encoder, rollout, and updates by a tape of the inner loss alone."""
         x = self.agent.encoder(observations)
-        actions = self.agent.rollout(x, goals)
+        actions, losses = self.agent.rollout(x, goals), []
         for _ in range(self.agent.model.updates):
             with torch.enable_grad():
                 leaf = actions.requires_grad_()
-                (gradient,) = torch.autograd.grad(self.agent.inner_loss(leaf, x, goals), leaf)
+                before = self.agent.inner_losses(leaf, x, goals)
+                (gradient,) = torch.autograd.grad(before.sum(), leaf)
             actions = leaf.detach() - self.agent.step_size * gradient
-        return actions
+            losses.append(before.detach())
+        return actions, torch.stack([*losses, self.agent.inner_losses(actions, x, goals)])
 
-    def traced(self, observations: Tensor, goals: Tensor) -> Tensor:
+    def traced(self, observations: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
         """The same, with the gradient that the compiler sees through."""
+
+        def inner_loss(actions: Tensor) -> tuple[Tensor, Tensor]:
+            losses = self.agent.inner_losses(actions, x, goals)
+            return losses.sum(), losses
+
         x = self.agent.encoder(observations)
-        actions = self.agent.rollout(x, goals)
+        actions, losses = self.agent.rollout(x, goals), []
         for _ in range(self.agent.model.updates):
-            actions = actions - self.agent.step_size * torch.func.grad(self.agent.inner_loss)(actions, x, goals)
-        return actions
+            gradient, before = torch.func.grad(inner_loss, has_aux=True)(actions)
+            actions = actions - self.agent.step_size * gradient
+            losses.append(before)
+        return actions, torch.stack([*losses, self.agent.inner_losses(actions, x, goals)])
 
 
 def main(model: Path, batch: int, threads: int, compile: bool = False) -> None:  # noqa: A002 - the option's name

@@ -20,7 +20,7 @@ from jax import Array
 
 from cpn_bench.harness import check_cores
 from cpn_bench.model import ModelConfig
-from cpn_bench.networks_jax import Weights, encode, plan, rollout
+from cpn_bench.networks_jax import Weights, encode, improve, rollout
 from cpn_bench.train.batches import Batches
 from cpn_bench.train.contender import LEARNING_RATE, MAX_GRADIENT_NORM, serve
 
@@ -35,7 +35,7 @@ def outer_loss(
         x, goal = jnp.split(encode(weights, model, jnp.concatenate([observations, goals])), 2)
     else:
         x = goal = encode(weights, model, observations)
-    planned = (plan if model.plans else rollout)(weights, model, x, goal)
+    planned = improve(weights, model, x, goal)[0] if model.plans else rollout(weights, model, x, goal)
     squared = jnp.square(planned - demonstrated) * mask[..., None]
     return squared.sum() / (mask.sum() * demonstrated.shape[-1])
 
