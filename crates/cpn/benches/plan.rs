@@ -1,12 +1,13 @@
 //! Our side of `make bench-plan`: writes the model and the images that everybody plans with, and plans when asked to.
 //!
 //! Numbers of batches come in on stdin, one a line; what they took goes out as a line of JSON. `stages` asks where the time of
-//! a batch went, on average over all so far.
+//! a batch went, on average over all so far; `plans` asks for those of the first batch.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
 use clap::Parser;
 use cpn::archive::{self, Tensors};
+use cpn::loss::Precision;
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Planner, checkpoint, images};
 use rand::{RngExt, SeedableRng};
@@ -28,6 +29,9 @@ struct Args {
     /// Write a model, and images beside its weights.
     #[arg(long)]
     write_model: Option<PathBuf>,
+    /// Of this checkpoint, instead of a new one.
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
     #[arg(long, default_value = "cpn")]
     method: String,
     #[arg(long)]
@@ -40,6 +44,9 @@ struct Args {
     batch: usize,
     #[arg(long, default_value_t = 1)]
     threads: usize,
+    /// Encode in bfloat16.
+    #[arg(long)]
+    bfloat16: bool,
     /// What `cargo bench` says.
     #[arg(long, hide = true)]
     bench: bool,
@@ -49,7 +56,7 @@ fn main() {
     let args = Args::parse();
     match (&args.write_model, &args.model) {
         (Some(path), _) => write(path, &args),
-        (None, Some(path)) => plan(path, args.batch, args.threads),
+        (None, Some(path)) => plan(path, &args),
         (None, None) => unreachable!("clap wants one"),
     }
 }
@@ -63,7 +70,10 @@ fn write(path: &PathBuf, args: &Args) {
         encoder.latent = args.latent.unwrap_or(encoder.latent);
     }
     config.validate().unwrap();
-    let agent = Agent::new(config, SEED);
+    let agent = match &args.checkpoint {
+        Some(path) => checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent,
+        None => Agent::new(config, SEED),
+    };
     let noise = |seed| {
         let mut bytes = vec![0; FRAMES * images::BYTES];
         ChaCha8Rng::seed_from_u64(seed).fill(bytes.as_mut_slice());
@@ -75,14 +85,16 @@ fn write(path: &PathBuf, args: &Args) {
     std::fs::write(path, archive::to_bytes(&tensors, agent.config()).unwrap()).unwrap();
 }
 
-fn plan(path: &PathBuf, batch: usize, threads: usize) {
+fn plan(path: &PathBuf, &Args { batch, threads, bfloat16, .. }: &Args) {
+    tch::set_num_threads(threads as i32);
     let (tensors, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
     let bytes = |name: &str| Vec::<u8>::try_from(tensors[name].flatten(0, -1)).unwrap();
     let (frames, goals) = (bytes("frames"), bytes("goals"));
     let weights = tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t)));
     let agent = Agent::new(config.clone(), SEED);
     checkpoint::copy_weights(&weights.collect(), &agent).unwrap();
-    let mut planner = Planner::new(&agent, threads);
+    let precision = if bfloat16 { Precision::Bfloat16 } else { Precision::Float32 };
+    let mut planner = Planner::new(agent, precision, threads);
     let observed = |bytes| -> Vec<_> { <[u8]>::chunks_exact(bytes, images::BYTES).map(Observed::Image).collect() };
     let (frames, x_gs) = (observed(&frames), planner.encode(&observed(&goals)));
     let (mut encoding, mut planning, mut batches) = (0.0, 0.0, 0);
@@ -100,12 +112,16 @@ fn plan(path: &PathBuf, batch: usize, threads: usize) {
         batches += 1;
         (plans, json!({"encoder": encoding / f64::from(batches), "planner": planning / f64::from(batches)}))
     };
-    let first = run(0).0.remove(0);
-    println!("{}", json!({"ready": true, "actions": first.actions}));
+    let plans = run(0).0;
+    println!("{}", json!({"ready": true, "actions": plans[0].actions}));
     for line in io::stdin().lock().lines() {
         let line = line.unwrap();
         if line.trim() == "stages" {
             println!("{}", json!({"stages": run(0).1}));
+            continue;
+        }
+        if line.trim() == "plans" {
+            println!("{}", json!({"plans": plans.iter().map(|plan| &plan.actions).collect::<Vec<_>>()}));
             continue;
         }
         let (count, started): (usize, _) = (line.trim().parse().unwrap(), Instant::now());

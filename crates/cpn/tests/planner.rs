@@ -6,6 +6,7 @@ mod common;
 
 use common::{double_agent, noise_images, position_config, small_config, uniform};
 use cpn::images;
+use cpn::loss::Precision;
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Planner, Random};
 use proptest::prelude::*;
@@ -22,7 +23,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
 /// The same weights in float64, to compare with, and laid out for planning.
 fn both(config: ModelConfig, step_size: f64, threads: usize) -> (Agent, Planner) {
     let (double, single) = agents(config, step_size);
-    (double, Planner::new(&single, threads))
+    (double, Planner::new(single, Precision::Float32, threads))
 }
 
 /// The same weights in float64 and in float32.
@@ -90,11 +91,11 @@ proptest! {
     fn plans_are_those_of_autograd(config in sizes(), rows in 1usize..40, seed in 0u64..1000) {
         let (latent, updates) = (config.encoder.latent(), config.updates as usize);
         let (agent, single) = agents(config, 0.05);
-        let mut planner = Planner::new(&single, 1);
         let ((x, xs), (x_g, x_gs)) = (embeddings(rows, latent, seed), embeddings(rows, latent, seed + 1));
         let reference = agent.plan(&xs, &x_gs);
         // An untrained model's rollouts can be steep, so that rounding grows along them, autograd's as much as ours.
         let rounded = single.plan(&xs.to_kind(Kind::Float), &x_gs.to_kind(Kind::Float));
+        let mut planner = Planner::new(single, Precision::Float32, 1);
         let plans = planner.plan(&queries(&x, &x_g, &[]), &mut fixed(Solver::Gradient, updates));
         for (row, plan) in plans.iter().enumerate() {
             let actions = floats(&reference.actions.get(row as i64));
@@ -128,6 +129,18 @@ fn embeddings_are_those_of_libtorch() {
         for (row, x) in planner.encode(&positions.map(Observed::Position)).into_iter().enumerate() {
             assert_close("x", x.into_iter(), &floats(&reference.get(row as i64)), 0.0);
         }
+    }
+}
+
+#[test]
+fn embeddings_in_bfloat16_are_close() {
+    let agent = Agent::new(ModelConfig::paper(MethodKind::Cpn), 0);
+    let exact = agent.encode(&noise_images(3, 1));
+    let bytes: Vec<u8> = Vec::try_from(noise_images(3, 1).flatten(0, -1)).unwrap();
+    let inputs: Vec<_> = bytes.chunks_exact(images::BYTES).map(Observed::Image).collect();
+    for (row, x) in Planner::new(agent, Precision::Bfloat16, 1).encode(&inputs).into_iter().enumerate() {
+        let error = farthest(&x.into_iter().map(f64::from).collect::<Vec<_>>(), &floats(&exact.get(row as i64)));
+        assert!(error > 0.0 && error < 0.1, "{error}: layer-normalised, so that values are about 1");
     }
 }
 

@@ -4,6 +4,7 @@
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
 use clap::Parser;
+use cpn::loss::Precision;
 use cpn::method::{Iterations, Observed, Query, Solver};
 use cpn::{Method, checkpoint};
 use futures::future::join_all;
@@ -123,7 +124,7 @@ async fn main() {
 /// Plans by the library, so many at a time, without a service: what there is to be had.
 fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     let bytes = std::fs::read(models.join(format!("{MODEL}.safetensors"))).unwrap();
-    let mut planner = cpn::Planner::new(&checkpoint::from_bytes(&bytes).unwrap().agent, 1);
+    let mut planner = cpn::Planner::new(checkpoint::from_bytes(&bytes).unwrap().agent, Precision::Float32, 1);
     let (goal, frames): (Image, Vec<Image>) = (image(0), (1..=batch as u8).map(image).collect());
     let x_g = planner.encode(&[Observed::Image(goal.data())]).remove(0);
     let updates = planner.updates().unwrap();

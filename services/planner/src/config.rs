@@ -1,5 +1,6 @@
 //! What the planner can be told: what was typed, and what came of it.
 
+use cpn::loss::Precision;
 use serde::{Deserialize, Serialize};
 use service_kit::SessionConfig;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -31,6 +32,8 @@ pub struct Config {
     pub batch_delay_ms: u16,
     /// Threads that plans which are made together are spread over.
     pub threads: NonZeroU16,
+    /// What images are embedded in: bfloat16 is faster for many robots at once, and close.
+    pub precision: Precision,
     /// Where Prometheus finds metrics; none are served if it is not given.
     pub metrics_listen: Option<SocketAddr>,
     /// How the planner joins the others over zenoh.
@@ -53,6 +56,7 @@ impl Default for Config {
             batch_size: count(64),
             batch_delay_ms: 0,
             threads: count(1),
+            precision: Precision::Float32,
             metrics_listen: None,
             session: SessionConfig::default(),
         }
@@ -110,6 +114,10 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<NonZeroU16>,
+    /// What images are embedded in, float32 or bfloat16 [default: float32].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub precision: Option<String>,
     /// Where Prometheus finds metrics, for example 127.0.0.1:9465 [default: nowhere].
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]

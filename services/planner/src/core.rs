@@ -2,12 +2,11 @@
 
 use crate::config::Config;
 use crate::goals::Goals;
-use crate::model::{Model, RANDOM};
+use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::unknown_model;
 use crate::task::PlanTask;
 use anyhow::Context;
-use std::num::NonZeroU16;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
@@ -31,7 +30,7 @@ pub struct PlannerCore {
     goals: Arc<Goals>,
     loads: Arc<Semaphore>,
     models_dir: Arc<Path>,
-    threads: NonZeroU16,
+    computing: Computing,
 }
 
 impl PlannerCore {
@@ -40,8 +39,9 @@ impl PlannerCore {
     /// # Errors
     /// Names the first checkpoint that cannot be loaded, and why.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
-        let (folder, threads) = (config.models_dir.clone(), config.threads);
-        let models = tokio::task::spawn_blocking(move || load_all(&folder, threads)).await??;
+        let computing = Computing { precision: config.precision, threads: config.threads };
+        let folder = config.models_dir.clone();
+        let models = tokio::task::spawn_blocking(move || load_all(&folder, computing)).await??;
         for Model { info, .. } in &models {
             info!(model = info.name, method = info.method, digest = info.digest, "serving");
         }
@@ -50,7 +50,7 @@ impl PlannerCore {
             goals: Arc::new(Goals::new(config.goal_capacity)),
             loads: Arc::new(Semaphore::new(MAX_LOADS)),
             models_dir: config.models_dir.clone().into(),
-            threads,
+            computing,
         })
     }
 
@@ -119,8 +119,8 @@ impl PlannerCore {
         let _load = self.loads.try_acquire().map_err(|_| {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
-        let (folder, threads) = (Arc::clone(&self.models_dir), self.threads);
-        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request, threads)).await? })
+        let (folder, computing) = (Arc::clone(&self.models_dir), self.computing);
+        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request, computing)).await? })
     }
 
     /// The same with a published checkpoint, whose bytes must be what its manifest says.
@@ -132,8 +132,8 @@ impl PlannerCore {
         check_replaceable(&manifest.model)?;
         // It comes once and unasked, so that it waits where a client would be sent away.
         let _load = self.loads.acquire().await;
-        let threads = self.threads;
-        self.swap_in(move || Model::published(manifest, &bytes, threads)).await.map(drop)
+        let computing = self.computing;
+        self.swap_in(move || Model::published(manifest, &bytes, computing)).await.map(drop)
     }
 
     async fn swap_in(&self, load: impl FnOnce() -> Result<Model, Error> + Send + 'static) -> Result<ModelInfo, Error> {
@@ -166,10 +166,10 @@ impl PlannerCore {
 }
 
 /// `random` and every checkpoint in `folder`.
-fn load_all(folder: &Path, threads: NonZeroU16) -> anyhow::Result<Vec<Model>> {
+fn load_all(folder: &Path, computing: Computing) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
     for path in checkpoints(folder).with_context(|| format!("model folder {}", folder.display()))? {
-        models.push(load_file(folder, &path, threads).with_context(|| format!("checkpoint {}", path.display()))?);
+        models.push(load_file(folder, &path, computing).with_context(|| format!("checkpoint {}", path.display()))?);
     }
     if models.len() == 1 {
         warn!(folder = %folder.display(), "no checkpoints: only the random model is served");
@@ -189,14 +189,14 @@ fn checkpoints(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-fn load_file(folder: &Path, path: &Path, threads: NonZeroU16) -> Result<Model, Error> {
+fn load_file(folder: &Path, path: &Path, computing: Computing) -> Result<Model, Error> {
     let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let source = CheckpointSource::File(text(path.file_name()));
     let request = LoadModelRequest { model: text(path.file_stem()), source };
     // A file's name is as free as a stranger's message: the trip through the wire applies the same rules to it.
     let request: LoadModelRequest = wire::decode(&wire::encode(request))?;
     check_replaceable(&request.model)?;
-    Model::load(folder, request, threads)
+    Model::load(folder, request, computing)
 }
 
 fn check_replaceable(name: &str) -> Result<(), Error> {

@@ -2,6 +2,7 @@
 
 use crate::task::PlanTask;
 use cpn::checkpoint::{self, Checkpoint, Provenance};
+use cpn::loss::Precision;
 use cpn::method::{self, Iterations, Observed, Query};
 use cpn::{Input, Method, Plan, Planner, Random, images};
 use service_kit::files;
@@ -21,6 +22,13 @@ const RANDOM_ACTIONS: usize = 4;
 const SAMPLES: u32 = 64;
 /// Generations, likewise.
 const GENERATIONS: u32 = 4;
+
+/// What models compute with.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Computing {
+    pub(crate) precision: Precision,
+    pub(crate) threads: NonZeroU16,
+}
 
 /// A method with the name and digest it is served under.
 pub struct Model {
@@ -56,7 +64,7 @@ impl Model {
     ///
     /// # Errors
     /// If the file is not there, or for anything wrong with the checkpoint, with the reason in `got`.
-    pub(crate) fn load(folder: &Path, request: LoadModelRequest, threads: NonZeroU16) -> Result<Self, Error> {
+    pub(crate) fn load(folder: &Path, request: LoadModelRequest, computing: Computing) -> Result<Self, Error> {
         let bytes = match request.source {
             CheckpointSource::Bytes(bytes) => bytes,
             // One byte more than a checkpoint may have, so that it is refused as too large.
@@ -66,14 +74,14 @@ impl Model {
                     _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
                 })?,
         };
-        Self::tried(request.model, 0, read(&bytes)?, threads)
+        Self::tried(request.model, 0, read(&bytes)?, computing)
     }
 
     /// Reads a published checkpoint, if the bytes are what its manifest says, and tries it once. Blocks.
     ///
     /// # Errors
     /// If they are not, with the manifest's field, or for anything wrong with the checkpoint.
-    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], threads: NonZeroU16) -> Result<Self, Error> {
+    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], computing: Computing) -> Result<Self, Error> {
         let CheckpointManifest { model, version, digest, config_digest, .. } = manifest;
         let got = checkpoint::digest(bytes);
         if got != digest {
@@ -83,13 +91,14 @@ impl Model {
         if loaded.config_digest != config_digest {
             return Err(Error::invalid("config_digest", config_digest, loaded.config_digest));
         }
-        Self::tried(model, version, loaded, threads)
+        Self::tried(model, version, loaded, computing)
     }
 
     /// What a checkpoint holds, once it has planned.
-    fn tried(name: String, version: u32, loaded: Checkpoint, threads: NonZeroU16) -> Result<Self, Error> {
+    fn tried(name: String, version: u32, loaded: Checkpoint, computing: Computing) -> Result<Self, Error> {
         let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
-        let method: Box<dyn Method> = Box::new(Planner::new(&loaded.agent, usize::from(threads.get())));
+        let threads = usize::from(computing.threads.get());
+        let method: Box<dyn Method> = Box::new(Planner::new(loaded.agent, computing.precision, threads));
         let info = info(name, version, &*method, loaded.digest, training_tasks);
         let mut model = Self { info, render_spec, method };
         model.warm_up()?;

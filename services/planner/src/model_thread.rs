@@ -44,8 +44,12 @@ impl ModelThread {
         let infos = models.iter().map(|model| (model.info.name.clone(), model.info.clone())).collect();
         let (published, subscribed) = watch::channel(infos);
         let load = Arc::new(Load::default());
+        let threads = config.threads.get();
         let owner = Owner::new(config, models, published, Arc::clone(&load));
-        thread::Builder::new().name("model".into()).spawn(move || owner.run(&receiver))?;
+        thread::Builder::new().name("model".into()).spawn(move || {
+            tch::set_num_threads(threads.into());
+            owner.run(&receiver);
+        })?;
         let capacity = config.queue_capacity.get();
         let places = Arc::new(Semaphore::new(capacity.into()));
         Ok(Self { jobs: sender, places, capacity, load, models: subscribed })

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import tyro
 
 from cpn_bench import chart, harness
@@ -38,6 +39,7 @@ GROWTH = {
 }
 """What grows of CPN, one at a time; the others are as in the paper, the batch 1."""
 UNIT = "plans/s"
+BFLOAT16 = "ours, bfloat16"
 RELATIVE_TOLERANCE = ABSOLUTE_TOLERANCE = 1e-3
 """Between the first plans of contenders."""
 LOAD_SECONDS, QUICK_LOAD_SECONDS = 10.0, 2.0
@@ -106,6 +108,27 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
     return rows
 
 
+def compare_precisions(ours: Sequence[str], effort: Effort) -> list[Row]:
+    """Ours in bfloat16 beside ours in float32, at the largest batch; prints by how much the shipped model's actions differ."""
+    setting = Setting("cpn", max(BATCHES))
+    checkpoint = str(Path(__file__).resolve().parents[5] / "models/cpn.safetensors")
+    with written_model([*ours, "--checkpoint", checkpoint], setting) as path:
+        options = ["--model", str(path), "--batch", str(setting.batch)]
+        commands = {BFLOAT16: [*ours, *options, "--bfloat16"], OURS: [*ours, *options]}
+        with harness.contenders(commands, setting.threads) as started:
+            half, full = (np.clip(contender.ask("plans")["plans"], -1, 1) for contender in started)
+            rates = harness.take_turns(started, effort) * setting.batch
+    rows = harness.tell(f"{setting.name}, bfloat16", [OURS], rates, UNIT, COMMAND)
+    first, whole = np.abs(half - full)[:, 0], np.abs(half - full)
+    print(
+        f"{setting.name}, bfloat16: actions, from -1 to 1, of {len(full)} plans between pictures of noise differ by "
+        f"{whole.mean():.4f} on average and {whole.max():.3f} at most, the first of each by {first.mean():.4f} and "
+        f"{first.max():.3f}",
+        flush=True,
+    )
+    return rows
+
+
 @cache
 def operations_per_second(threads: int) -> float:
     """What this machine can do on so many cores."""
@@ -139,6 +162,7 @@ def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
     peers, effort = ((EAGER, JAX), QUICK) if quick else (tuple(PEERS), MAIN)
     for setting in settings():
         keep(compare(command, peers, setting, effort))
+    keep(compare_precisions(command, effort))
     if not quick:
         for grown, values in GROWTH.items():
             for value in values:
