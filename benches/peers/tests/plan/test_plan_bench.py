@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import plan_stand_in
@@ -10,7 +11,7 @@ import pytest
 from cpn_bench import chart, harness
 from cpn_bench.harness import EAGER, JAX
 from cpn_bench.plan import bench, load_chart, service
-from cpn_bench.plan.service import LITSERVE, Measurement
+from cpn_bench.plan.service import LITSERVE, Measurement, Overload
 
 OURS = [sys.executable, str(Path(plan_stand_in.__file__))]
 EFFORT = harness.Effort(turns=2, turn_seconds=0.05)
@@ -72,9 +73,11 @@ def test_litserve_is_measured(tmp_path: Path) -> None:
 
 def test_our_service_is_measured_by_its_bench() -> None:
     line = {"transport": "gRPC", "clients": 1, "plans_per_second": 2.0, "p50_ms": 1.0, "p99_ms": 3.0, "n": 9}
-    lines = json.dumps(line | {"server_ms_p50": 0.5})
+    overload = Overload(4.0, 10.0, 100, 40, 9, 9, 30, 1, 0.2, 0.3)
+    lines = json.dumps(line | {"server_ms_p50": 0.5}) + "\n" + json.dumps(asdict(overload))
     script = f"import sys, pathlib; pathlib.Path(sys.argv[2]).write_text({lines!r} + chr(10))"
-    assert service.ours([sys.executable, "-c", script]) == [Measurement("gRPC", 1, 2.0, 1.0, 3.0, 9, 0.5)]
+    measured = service.ours([sys.executable, "-c", script], seconds=1.0)
+    assert measured == ([Measurement("gRPC", 1, 2.0, 1.0, 3.0, 9, 0.5)], overload)
 
 
 def test_services_become_rows() -> None:

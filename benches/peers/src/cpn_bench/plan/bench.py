@@ -42,7 +42,7 @@ UNIT = "plans/s"
 BFLOAT16 = "ours, bfloat16"
 RELATIVE_TOLERANCE = ABSOLUTE_TOLERANCE = 1e-3
 """Between the first plans of contenders."""
-LOAD_SECONDS, QUICK_LOAD_SECONDS = 10.0, 2.0
+LOAD_SECONDS, QUICK_LOAD_SECONDS = 5.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
 
 
 def compare_precisions(ours: Sequence[str], effort: Effort) -> list[Row]:
-    """Ours in bfloat16 beside ours in float32, at the largest batch; prints by how much the shipped model's actions differ."""
+    """Ours in bfloat16 beside ours in float32; prints by how much the shipped model's actions differ."""
     setting = Setting("cpn", max(BATCHES))
     checkpoint = str(Path(__file__).resolve().parents[5] / "models/cpn.safetensors")
     with written_model([*ours, "--checkpoint", checkpoint], setting) as path:
@@ -169,9 +169,12 @@ def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
                 keep(compare(command, (EAGER, JAX), Setting("cpn", grown=grown, value=value), CURVE))
         chart.draw(rows, GROWTH, f"{UNIT}, batch 1, one thread", out / "plan.svg")
     with written_model(command, Setting("cpn")) as path:
-        measured = service.ours(shlex.split(serve))
-        measured += service.litserve(path, QUICK_LOAD_SECONDS if quick else LOAD_SECONDS)
+        seconds = QUICK_LOAD_SECONDS if quick else LOAD_SECONDS
+        measured, overload = service.ours(shlex.split(serve), seconds)
+        measured += service.litserve(path, seconds)
     service.tell(measured)
+    service.tell_cost(measured)
+    service.tell_overload(overload)
     keep(service.rows(measured, COMMAND))
     load_chart.draw(measured, out / "load.svg")
     print(f"wrote {out / 'plan.json'}")

@@ -49,8 +49,8 @@ class PlanModel:
         horizon, updates = self.model.horizon, self.model.updates
         # The rollout predicts no state after its last action.
         rollout = horizon * (policy + step) - products("dynamics")
-        # The loss before an update is part of it. Backwards as many products as forwards, but that the first features do
-        # not depend on an action.
+        # The loss before an update is part of it. Backwards as many products as forwards, but that the first features
+        # do not depend on an action.
         update = 2 * horizon * step - products("trunk")
         evaluation = horizon * step
         return MULTIPLY_AND_ADD * (encoder + rollout + updates * update + evaluation)

@@ -18,6 +18,8 @@ from pathlib import Path
 from cpn_bench.harness import ENVIRONMENT, Row, module
 
 LITSERVE = "LitServe + PyTorch"
+LIBRARY = "library"
+"""Our planner without a service, as many plans at a time as there are clients."""
 COMPARED = ("zenoh tcp", "gRPC")
 """Our transports that cross a network as HTTP does."""
 FEW, MANY = 1, 32
@@ -41,12 +43,33 @@ class Measurement:
     """Of what the server says that a plan took it."""
 
 
-def ours(command: Sequence[str]) -> list[Measurement]:
-    """Has our bench measure our service over every transport."""
+@dataclass(frozen=True)
+class Overload:
+    """What becomes of more requests than can be answered, each with a deadline."""
+
+    overload: float
+    """Times as many as can be answered."""
+    capacity_plans_per_second: float
+    deadline_ms: int
+    n: int
+    """Requests: answered, refused, or answered by an error when the deadline had passed."""
+    answered: int
+    answered_in_time: int
+    refused: int
+    late: int
+    refused_p50_ms: float
+    """How long a refusal takes."""
+    refused_p99_ms: float
+
+
+def ours(command: Sequence[str], seconds: float) -> tuple[list[Measurement], Overload]:
+    """Has our bench measure our service over every transport, for so many seconds each."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "load.jsonl"
-        subprocess.run([*command, "--out", str(path)], check=True, stdout=sys.stderr)
-        return [Measurement(**json.loads(line)) for line in path.read_text().splitlines()]
+        subprocess.run([*command, "--out", str(path), "--seconds", str(seconds)], check=True, stdout=sys.stderr)
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+    (overload,) = [Overload(**line) for line in lines if "overload" in line]
+    return [Measurement(**line) for line in lines if "overload" not in line], overload
 
 
 def litserve(model: Path, seconds: float) -> list[Measurement]:
@@ -103,6 +126,29 @@ def tell(measured: Sequence[Measurement]) -> None:
         print(
             f"{m.transport:20s} {m.clients:3d} client{'s'[: m.clients > 1]:1s} {m.plans_per_second:8.0f} plans/s, "
             f"p50 {m.p50_ms:.2f} ms, p99 {m.p99_ms:.2f} ms{server} (n = {m.n})",
+            flush=True,
+        )
+
+
+def tell_overload(o: Overload) -> None:
+    """Prints how overload was borne."""
+    print(
+        f"overload, {o.overload:.0f} times {o.capacity_plans_per_second:.0f} plans/s, deadline {o.deadline_ms} ms: "
+        f"of {o.n} requests {o.answered} answered, {o.answered_in_time} of them in time, {o.refused} refused (p50 "
+        f"{o.refused_p50_ms:.2f} ms, p99 {o.refused_p99_ms:.2f} ms), {o.late} late",
+        flush=True,
+    )
+
+
+def tell_cost(measured: Sequence[Measurement]) -> None:
+    """Prints what the service adds to the plans themselves, for one client and for many."""
+    of = {(m.transport, m.clients): m for m in measured}
+    library = of[LIBRARY, MANY].plans_per_second
+    for transport in (m.transport for m in measured if m.clients == FEW and m.server_ms_p50 is not None):
+        one, many = of[transport, FEW], of[transport, MANY]
+        print(
+            f"{transport:20s} adds {one.p50_ms - (one.server_ms_p50 or 0):.2f} ms to a plan at {FEW} client, "
+            f"and with {MANY} has {many.plans_per_second / library:.0%} of the plans/s of the library alone",
             flush=True,
         )
 
