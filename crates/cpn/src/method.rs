@@ -103,6 +103,11 @@ impl Iterations<'_> {
         }
     }
 
+    /// Whether it is known that there is to be none after `done`.
+    pub(crate) fn ends_at(&self, done: usize) -> bool {
+        matches!(self, Self::Fixed(count) if done >= *count)
+    }
+
     /// Whether the best plan counts, for nobody knows which will be the last.
     pub(crate) fn keep_best(&self) -> bool {
         matches!(self, Self::While(_))

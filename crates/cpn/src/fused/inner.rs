@@ -23,6 +23,17 @@ pub enum Actions {
     Proposed,
 }
 
+/// What a rollout is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// The policy's actions; the state after the last is of no interest.
+    Actions,
+    /// The inner loss alone: the steps may share a tape, which stays in the caches.
+    Loss,
+    /// The inner loss, and its gradient afterwards.
+    Gradient,
+}
+
 impl<T: Real> Rollout<T> {
     /// Room for H = `horizon` steps of blocks of up to `rows` samples.
     pub fn new(network: &Network<T>, rows: usize, horizon: usize) -> Self {
@@ -33,26 +44,25 @@ impl<T: Real> Rollout<T> {
         }
     }
 
-    /// Moves x, `[R, Z]`, along the actions, `[H, R, A]`, towards x_g, `[R, Z]`. Actions that are proposed are written there.
-    /// The state after the last one is not needed by who only wants the policy's actions: then `to_the_end` is false.
+    /// Moves x, `[R, Z]`, along the actions, `[H, R, A]`, towards x_g, `[R, Z]`. Actions that are proposed are written
+    /// there.
     pub fn forward(
         &mut self,
         network: &Network<T>,
         (x, x_g): (&mut [T], &[T]),
         (source, actions): (Actions, &mut [T]),
-        to_the_end: bool,
+        purpose: Purpose,
         buffers: &mut Buffers<T>,
     ) {
         let rows = x.len() / network.sizes.latent;
         let horizon = self.steps.len();
-        for (t, (step, action)) in
-            self.steps.iter_mut().zip(actions.chunks_mut(rows * network.sizes.actions)).enumerate()
-        {
+        for (t, action) in actions.chunks_mut(rows * network.sizes.actions).take(horizon).enumerate() {
+            let step = &mut self.steps[if purpose == Purpose::Loss { 0 } else { t }];
             network.features(rows, step, x, x_g);
             if source == Actions::Proposed {
                 network.policy(rows, step, action);
             }
-            if to_the_end || t + 1 < horizon {
+            if purpose != Purpose::Actions || t + 1 < horizon {
                 network.next(rows, step, action, x, buffers);
             }
         }

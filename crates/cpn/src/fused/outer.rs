@@ -1,7 +1,7 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
 use super::dense::Order;
-use super::inner::{Actions, Rollout, clamp};
+use super::inner::{Actions, Purpose, Rollout, clamp};
 use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
 use super::real::Real;
 
@@ -156,7 +156,8 @@ impl<T: Real> Workspace<T> {
         let x = &mut x[..samples.x.len()];
         x.copy_from_slice(samples.x);
         let source = if k == 0 { Actions::Proposed } else { Actions::Given };
-        rollouts[k].forward(network, (x, samples.x_g), (source, actions), settings.updates > 0, buffers);
+        let purpose = if settings.updates > 0 { Purpose::Gradient } else { Purpose::Actions };
+        rollouts[k].forward(network, (x, samples.x_g), (source, actions), purpose, buffers);
     }
 
     /// Update k of the actions: a step down the inner loss, by its gradient in the actions.

@@ -1,7 +1,7 @@
 //! Plans without a graph, in memory that is kept from plan to plan.
 
 use super::encoder::{Encoder, Room};
-use super::inner::{Actions, Rollout};
+use super::inner::{Actions, Purpose, Rollout};
 use super::linear::Weights;
 use super::network::{Buffers, Network};
 use super::real::Real;
@@ -93,12 +93,13 @@ impl<T: Real> Worker<T> {
         }
     }
 
-    /// Rolls out from x along the actions, which the policy proposes or somebody has written; answers the inner losses.
+    /// Rolls out from x along the actions, which the policy proposes or somebody has written; answers the inner losses. What
+    /// is rolled out for its loss alone cannot be improved afterwards.
     /// `x` and `x_g` come row by row, `[Z]` each.
     pub(super) fn roll_out<'a>(
         &mut self,
         dynamics: &Dynamics<T>,
-        source: Actions,
+        (source, purpose): (Actions, Purpose),
         ends: impl Iterator<Item = (&'a [T], &'a [T])>,
     ) -> impl Iterator<Item = T> {
         let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
@@ -110,7 +111,7 @@ impl<T: Real> Worker<T> {
             rows += 1;
         }
         let ends = (&mut x[..rows * latent], &x_g[..rows * latent]);
-        rollout.forward(network, ends, (source, actions), dynamics.plans, buffers);
+        rollout.forward(network, ends, (source, actions), purpose, buffers);
         rollout.losses(network, rows)
     }
 
@@ -159,18 +160,19 @@ impl Worker<f32> {
         for (r, query) in queries.iter().enumerate() {
             self.set_plan(dynamics, rows, r, query.start);
         }
-        let losses: Vec<f32> = self.roll_out(dynamics, source, ends()).collect();
-        let begun = |(r, loss)| Plan { actions: self.plan(dynamics, rows, r), inner_losses: vec![loss], iterations: 0 };
+        let purpose = if dynamics.plans { Purpose::Gradient } else { Purpose::Actions };
+        let losses: Vec<f32> = self.roll_out(dynamics, (source, purpose), ends()).collect();
+        let begun = |(r, loss)| {
+            let inner_losses = if dynamics.plans { vec![loss] } else { Vec::new() };
+            Plan { actions: self.plan(dynamics, rows, r), inner_losses, iterations: 0 }
+        };
         let mut plans: Vec<Plan> = losses.into_iter().enumerate().map(begun).collect();
-        if !dynamics.plans {
-            plans.iter_mut().for_each(|plan| plan.inner_losses.clear());
-            return plans;
-        }
         let mut done = 0;
-        while iterations.go_on(done) {
+        while dynamics.plans && iterations.go_on(done) {
             done += 1;
             self.descend(dynamics, rows);
-            let losses: Vec<f32> = self.roll_out(dynamics, Actions::Given, ends()).collect();
+            let purpose = if iterations.ends_at(done) { Purpose::Loss } else { Purpose::Gradient };
+            let losses: Vec<f32> = self.roll_out(dynamics, (Actions::Given, purpose), ends()).collect();
             for (r, (plan, loss)) in plans.iter_mut().zip(losses).enumerate() {
                 let best = plan.inner_losses[plan.inner_losses.len() - 1];
                 let better = loss < best || !iterations.keep_best();

@@ -1,7 +1,7 @@
 //! Searches that try plans and keep what came near the goal.
 
 use super::BLOCK;
-use super::inner::Actions;
+use super::inner::{Actions, Purpose};
 use super::planner::{Dynamics, Worker};
 use crate::method::{Iterations, Plan, Query, Solver};
 use rand::SeedableRng;
@@ -43,7 +43,7 @@ pub fn plan(
     let mut rng = ChaCha8Rng::seed_from_u64(query.seed);
     let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
     worker.set_plan(dynamics, 1, 0, query.start);
-    let loss = roll_out(worker, dynamics, query, source);
+    let loss = roll_out(worker, dynamics, query, (source, Purpose::Loss));
     let mut best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
     let spread = best.actions.iter().map(|action| vec![SPREAD; action.len()]).collect();
     let mut belief = Belief { mean: best.actions.clone(), spread };
@@ -61,9 +61,9 @@ pub fn plan(
         }
         if let Solver::Hybrid(_) = solver {
             worker.set_plan(dynamics, 1, 0, &belief.mean);
-            roll_out(worker, dynamics, query, Actions::Given);
+            roll_out(worker, dynamics, query, (Actions::Given, Purpose::Gradient));
             worker.descend(dynamics, 1);
-            let loss = roll_out(worker, dynamics, query, Actions::Given);
+            let loss = roll_out(worker, dynamics, query, (Actions::Given, Purpose::Loss));
             let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
             if descended.loss < nearest.loss {
                 belief.mean.clone_from(&descended.actions);
@@ -79,8 +79,8 @@ pub fn plan(
 }
 
 /// The inner loss of the worker's one plan.
-fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, source: Actions) -> f32 {
-    worker.roll_out(dynamics, source, [(query.x, query.x_g)].into_iter()).sum()
+fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, how: (Actions, Purpose)) -> f32 {
+    worker.roll_out(dynamics, how, [(query.x, query.x_g)].into_iter()).sum()
 }
 
 /// Fills in the losses.
@@ -91,7 +91,8 @@ fn evaluate(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>
             worker.set_plan(dynamics, rows, r, &candidate.actions);
         }
         let ends = std::iter::repeat_n((query.x, query.x_g), rows);
-        for (candidate, loss) in block.iter_mut().zip(worker.roll_out(dynamics, Actions::Given, ends)) {
+        for (candidate, loss) in block.iter_mut().zip(worker.roll_out(dynamics, (Actions::Given, Purpose::Loss), ends))
+        {
             candidate.loss = loss;
         }
     }
