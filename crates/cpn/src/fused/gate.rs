@@ -122,10 +122,10 @@ impl<T: Real> Gate<T> {
     }
 }
 
-/// relu(x), in place.
+/// relu(x), in place. What is not a number stays so, for somebody to see.
 pub fn rectify<T: Real>(x: &mut [T]) {
     for x in x {
-        *x = if *x > T::ZERO { *x } else { T::ZERO };
+        *x = if *x < T::ZERO { T::ZERO } else { *x };
     }
 }
 
