@@ -9,6 +9,8 @@ use tch::Tensor;
 
 /// The one metadata key; its value is a JSON document.
 const METADATA_KEY: &str = "cpn";
+/// Longest header that is read, in bytes: to parse one takes many times as much memory.
+const MAX_HEADER_BYTES: u64 = 1 << 20;
 
 /// Tensors by name, in the order they are written.
 pub type Tensors = BTreeMap<String, Tensor>;
@@ -42,8 +44,12 @@ pub fn to_bytes<M: Serialize>(tensors: &Tensors, metadata: &M) -> Result<Vec<u8>
 /// Reads what [`to_bytes`] wrote.
 ///
 /// # Errors
-/// If the file is truncated or malformed, or lacks a valid document.
+/// If the file is truncated or malformed, its header is too long, or it lacks a valid document.
 pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), ArchiveError> {
+    let header_bytes = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
+    if header_bytes > MAX_HEADER_BYTES {
+        return Err(ArchiveError(format!("header: expected at most {MAX_HEADER_BYTES} bytes, got {header_bytes}")));
+    }
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| ArchiveError(e.to_string()))?;
     let json = header
         .metadata()

@@ -84,6 +84,12 @@ fn an_oversized_file_is_refused() {
 }
 
 #[test]
+fn an_oversized_header_is_refused_unparsed() {
+    let message = refusal(|_, metadata| metadata["provenance"]["render_spec"] = json!("x".repeat(1 << 20)));
+    assert!(message.starts_with("checkpoint: safetensors: header: expected at most 1048576 bytes, got "), "{message}");
+}
+
+#[test]
 fn another_format_is_refused() {
     assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 3, got 1");
     // An older one lacks fields: that it is older is what counts.
