@@ -1,11 +1,11 @@
 //! MCAP files of protobuf messages: written in one go, and read as a stranger's.
 
 use crate::MAX_BYTES;
+use crate::records::{Channels, Message};
 use crate::topic::{ENCODING, Topic};
-use mcap::io::MessageReader;
-use mcap::records::MessageHeader;
-use mcap::sans_io::LinearReaderOptions;
-use mcap::{McapError, Message, WriteOptions};
+use mcap::records::{MessageHeader, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{McapError, WriteOptions};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Cursor, Read};
@@ -14,6 +14,8 @@ use wire::Error;
 
 /// Frames compress against those before them in the same chunk, so that a chunk holds a whole episode of usual length.
 const CHUNK_BYTES: u64 = 4 << 20;
+/// Most that is read at a time: what a record claims to have may not be there.
+const READ_BYTES: usize = 64 << 10;
 
 /// Why a recording was refused.
 #[derive(Debug, thiserror::Error)]
@@ -95,8 +97,13 @@ pub(crate) fn bytes(path: &Path) -> Result<Vec<u8>, ReadError> {
 
 /// The messages of a file, checked and bounded.
 pub(crate) struct Reader<R> {
-    reader: MessageReader<R>,
+    source: R,
+    reader: LinearReader,
+    channels: Channels,
+    /// Of all records so far.
     bytes: usize,
+    /// Whether what follows only repeats what came.
+    in_summary: bool,
 }
 
 impl<R: Read> Reader<R> {
@@ -107,26 +114,40 @@ impl<R: Read> Reader<R> {
             .with_validate_data_section_crc(true)
             .with_validate_summary_section_crc(true)
             .with_record_length_limit(MAX_BYTES);
-        Self { reader: MessageReader::new_with_options(source, options), bytes: 0 }
+        let (reader, channels) = (LinearReader::new_with_options(options), Channels::default());
+        Self { source, reader, channels, bytes: 0, in_summary: false }
     }
 
-    fn next(&mut self) -> Result<Option<Message<'static>>, ReadError> {
-        let Some(message) = self.reader.next().transpose()? else { return Ok(None) };
-        self.bytes += message.data.len();
-        check_size(self.bytes)?;
-        Ok(Some(message))
+    fn next(&mut self) -> Result<Option<Message>, ReadError> {
+        while let Some(event) = self.reader.next_event() {
+            match event? {
+                LinearReadEvent::ReadRequest(bytes) => {
+                    let read = self.source.read(self.reader.insert(bytes.min(READ_BYTES)))?;
+                    self.reader.notify_read(read);
+                }
+                LinearReadEvent::Record { opcode, data } => {
+                    self.bytes += data.len();
+                    check_size(self.bytes)?;
+                    self.in_summary |= opcode == op::DATA_END;
+                    if !self.in_summary
+                        && let Some(message) = self.channels.read(opcode, data)?
+                    {
+                        return Ok(Some(message));
+                    }
+                }
+            }
+        }
+        Ok(None)
     }
 
     /// The next message, which must be of this topic and its schema.
-    pub(crate) fn of(&mut self, topic: Topic) -> Result<Message<'static>, ReadError> {
+    pub(crate) fn of(&mut self, topic: Topic) -> Result<Message, ReadError> {
         let name = topic.name();
         let message = self.next()?.ok_or_else(|| Error::invalid(name, "a message", "the end of the file"))?;
-        let (channel, schema) = (&message.channel, message.channel.schema.as_ref());
+        let channel = &message.channel;
         check("topic", name, &channel.topic)?;
-        let expected = format!("{} as {ENCODING}", topic.schema_name());
-        let got = schema.map_or("none".to_owned(), |schema| format!("{} as {}", schema.name, schema.encoding));
-        check(&format!("{name}.schema"), &expected, &got)?;
-        check(&format!("{name}.encoding"), ENCODING, &channel.message_encoding)?;
+        check(&format!("{name}.schema"), &format!("{} as {ENCODING}", topic.schema_name()), &channel.schema)?;
+        check(&format!("{name}.encoding"), ENCODING, &channel.encoding)?;
         Ok(message)
     }
 

@@ -8,6 +8,7 @@ mod episode;
 mod file;
 pub mod plans;
 mod read;
+mod records;
 mod topic;
 mod write;
 

@@ -59,7 +59,7 @@ fn of_step(reader: &mut Reader<impl Read>, topic: Topic, number: u32, time: u64)
     let message = reader.of(topic)?;
     let place = |number, nanos| format!("number {number} at {nanos} ns");
     check(topic.name(), &place(number, time), &place(message.sequence, message.log_time))?;
-    Ok(message.data.into_owned())
+    Ok(message.data)
 }
 
 fn frame(bytes: &[u8]) -> Result<Image, Error> {

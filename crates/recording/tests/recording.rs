@@ -3,7 +3,7 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use foxglove::messages::RawImage;
-use mcap::records::MessageHeader;
+use mcap::records::{MessageHeader, op};
 use mcap::{MessageStream, WriteOptions, Writer};
 use proptest::prelude::*;
 use prost::Message as _;
@@ -105,6 +105,23 @@ fn a_cut_file_is_refused() {
         assert!(matches!(from_bytes(&good[..length]), Err(ReadError::Mcap(_) | ReadError::Content(_))), "{length}");
     }
     assert!(from_bytes(&[&good[..], b"x"].concat()).is_err(), "nothing may follow the end");
+}
+
+/// Lengths within a record may lead anywhere, where there are no checksums.
+#[test]
+fn a_record_is_not_taken_at_its_word() {
+    let record = |opcode: u8, data: &[u8]| [&[opcode][..], &(data.len() as u64).to_le_bytes(), data].concat();
+    let refusal = |records: &[u8]| from_bytes(&[mcap::MAGIC, records].concat()).unwrap_err().to_string();
+
+    let endless = [&[1, 0][..], &u32::MAX.to_le_bytes(), b"name"].concat();
+    let error = "recording: record: expected 4294967295 bytes more, got 4";
+    assert_eq!(refusal(&record(op::SCHEMA, &endless)), error);
+
+    // A chunk of 9 bytes begins a message of 100.
+    let message = record(op::MESSAGE, &[0; 100]);
+    let chunk = [&[0; 32][..], &9u64.to_le_bytes(), &message[..9]].concat();
+    let error = "recording: channel: expected a known one, got 0";
+    assert_eq!(refusal(&[&record(op::CHUNK, &chunk), &message[9..]].concat()), error);
 }
 
 #[test]
