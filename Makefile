@@ -10,7 +10,7 @@ OPENPI := tests/openpi/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench bench-sim bench-train bench-plan lint format clean
+.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -84,6 +84,9 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
 	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+fuzz: system .libtorch/build-version ## Feed the decoders what a stranger may send, ten minutes each (MINUTES=n); an input that breaks one fails it
+	scripts/fuzz.sh
+
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
 	cd sim-worker && $(UV) run --quiet ../benches/sim.py
 
@@ -98,13 +101,15 @@ bench-plan: build $(BENCH)/.ready ## Compare plans with PyTorch, JAX and ONNX Ru
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
+	cd fuzz && cargo fmt --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
 	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
+	cd fuzz && cargo fmt
 	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi
 
 clean: ## Remove what was built
-	rm -rf target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) .libtorch
+	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) .libtorch

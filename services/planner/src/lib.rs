@@ -22,6 +22,8 @@ use crate::core::PlannerCore;
 use crate::openpi::OpenpiServer;
 use crate::zenoh::ZenohServer;
 pub use config::Config;
+#[doc(hidden)]
+pub use openpi::request as openpi_request; // for the fuzzer
 use service_kit::{GrpcServer, metrics};
 use std::net::SocketAddr;
 use std::time::Duration;

@@ -4,7 +4,7 @@ use super::numpy::{self, Array, Fields, brief};
 use crate::core::PlannerCore;
 use crate::model::RANDOM;
 use rmpv::Value;
-use wire::planner::{Goal, ModelInfo, PlanRequest, PlanResponse, StageTimes};
+use wire::planner::{Goal, ListModelsResponse, ModelInfo, PlanRequest, PlanResponse, StageTimes};
 use wire::{Error, Image, Observation, Position};
 
 const OBSERVATION_IMAGE: &str = "observation/image";
@@ -51,11 +51,11 @@ pub(super) fn metadata(core: &PlannerCore) -> Vec<u8> {
     numpy::write(&numpy::map([("models", models), ("image_shape", image_shape.into())]))
 }
 
-/// What a client asks for.
+/// What a client asks for; `models` are those it can name.
 ///
 /// # Errors
 /// `INVALID_ARGUMENT` with the field that is missing, unknown, twice there, or not what it should be.
-pub(super) fn request(core: &PlannerCore, payload: &[u8]) -> Result<PlanRequest, Error> {
+pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> Result<PlanRequest, Error> {
     let mut fields = numpy::read(payload)?;
     if let Some(name) = fields.keys().find(|name| !FIELDS.contains(&name.as_str())) {
         return Err(Error::invalid("payload", format!("fields among {}", FIELDS.join(", ")), name));
@@ -71,7 +71,7 @@ pub(super) fn request(core: &PlannerCore, payload: &[u8]) -> Result<PlanRequest,
     let goal = one_of("goal", GOAL, &mut fields)?;
     let model = match fields.remove(MODEL) {
         Some(name) => text(name).map_err(|e| e.within(MODEL))?,
-        None => only_model(core)?,
+        None => only_model(models())?,
     };
     let seed = fields.remove(SEED).map_or(Ok(0), seed).map_err(|e| e.within(SEED))?;
     Ok(PlanRequest { seed, ..PlanRequest::new(model, goal, observation) })
@@ -89,8 +89,8 @@ fn one_of<T, const N: usize>(what: &str, readers: [Reader<T>; N], fields: &mut F
 }
 
 /// The name of the learned model, if there is no other that could be meant.
-fn only_model(core: &PlannerCore) -> Result<String, Error> {
-    let mut names: Vec<_> = core.list_models().models.into_iter().map(|info| info.name).collect();
+fn only_model(served: ListModelsResponse) -> Result<String, Error> {
+    let mut names: Vec<_> = served.models.into_iter().map(|info| info.name).collect();
     names.retain(|name| name != RANDOM);
     match &mut names[..] {
         [name] => Ok(std::mem::take(name)),

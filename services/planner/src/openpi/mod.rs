@@ -9,6 +9,7 @@ mod numpy;
 use crate::core::PlannerCore;
 use anyhow::Context;
 use futures::{SinkExt, StreamExt};
+pub use message::request;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -152,7 +153,7 @@ async fn shake_hands(stream: TcpStream, has_place: bool) -> Result<Socket, Socke
 }
 
 async fn answer(core: &PlannerCore, payload: &[u8]) -> Message {
-    let plan = async { core.plan(message::request(core, payload)?).await.map_err(message::renamed) };
+    let plan = async { core.plan(message::request(payload, || core.list_models())?).await.map_err(message::renamed) };
     plan.await.map_or_else(|error| refusal(&error), |plan| Message::binary(message::answer(plan)))
 }
 

@@ -1,0 +1,81 @@
+//! Checkpoints: no bytes make the reader panic or take much memory, and what it reads is written as it was read.
+
+#![no_main]
+
+use cpn::archive::{self, Tensors};
+use cpn::checkpoint::{self, CheckpointError, Provenance};
+use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, Training};
+use libfuzzer_sys::fuzz_target;
+use serde_json::Value;
+use std::sync::LazyLock;
+
+fuzz_target!(init: { tch::set_num_threads(1); fuzz::seed("checkpoint", inputs(), check) }, |input: &[u8]| {
+    let _ = check(input);
+});
+
+/// The first byte says whether a file follows or only the document of one, to stand beside the weights of an example:
+/// in a file, a document that is longer or shorter by a byte leaves nothing where it should be.
+fn check(input: &[u8]) -> Result<(), CheckpointError> {
+    match input {
+        [] => Ok(()),
+        [0, file @ ..] => check_file(file),
+        [number, document @ ..] => {
+            let Ok(document) = serde_json::from_slice(document) else { return Ok(()) };
+            let (weights, _): (Tensors, Value) =
+                archive::from_bytes(&EXAMPLES[usize::from(number - 1) % EXAMPLES.len()])?;
+            check_file(&archive::to_bytes::<Value>(&weights, &document)?)
+        }
+    }
+}
+
+fn check_file(file: &[u8]) -> Result<(), CheckpointError> {
+    let (tensors, document): (Tensors, Value) = archive::from_bytes(file)?;
+    let copy = archive::to_bytes(&tensors, &document).expect("what was read can be written");
+    let (same, _): (Tensors, Value) = archive::from_bytes(&copy).expect("what was written can be read");
+    assert_eq!(archive::to_bytes(&same, &document).expect("what was read can be written"), copy);
+
+    let read = checkpoint::from_bytes(file)?;
+    let copy = checkpoint::to_bytes(&read.agent, &read.provenance).expect("what was read can be written");
+    let same = checkpoint::from_bytes(&copy).expect("what was written can be read");
+    assert_eq!((same.provenance, same.config_digest), (read.provenance, read.config_digest));
+    Ok(())
+}
+
+/// Small checkpoints, of every kind of encoder.
+static EXAMPLES: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
+    let image = EncoderConfig::Image(ImageEncoderConfig {
+        convolutions: vec![ConvConfig { channels: 1, kernel: 8, stride: 16 }],
+        latent: 2,
+        layer_norm: true,
+    });
+    let position = EncoderConfig::Position(PositionEncoderConfig {
+        centre_mm: [500, 0, -200],
+        scale_mm: 400,
+        layers: vec![2],
+        latent: 2,
+        layer_norm: true,
+    });
+    [(MethodKind::TeBc, image), (MethodKind::Cpn, position)].map(|(method, encoder)| example(method, encoder))
+});
+
+fn example(method: MethodKind, encoder: EncoderConfig) -> Vec<u8> {
+    let config = ModelConfig { encoder, hidden: 2, gate_hidden: 1, actions: 2, ..ModelConfig::paper(method) };
+    let provenance = Provenance {
+        training_tasks: vec!["reach".into()],
+        data_digest: "0".repeat(64),
+        render_spec: r#"{"camera":"corner"}"#.into(),
+        seed: 5,
+        training: Training::paper(),
+    };
+    checkpoint::to_bytes(&Agent::new(config, 5), &provenance).expect("a checkpoint")
+}
+
+fn inputs() -> Vec<Vec<u8>> {
+    let files = EXAMPLES.iter().map(|file| [&[0], &file[..]].concat());
+    let documents = (1..).zip(EXAMPLES.iter()).map(|(number, file)| {
+        let (_, document): (Tensors, Value) = archive::from_bytes(file).expect("a checkpoint");
+        [&[number], document.to_string().as_bytes()].concat()
+    });
+    files.chain(documents).collect()
+}

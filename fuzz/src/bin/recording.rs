@@ -1,0 +1,130 @@
+//! Recordings: no bytes make the reader panic, and what it reads is written and read as the same again.
+
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use mcap::records::MessageHeader;
+use mcap::{Compression, McapError, Message, MessageStream, WriteOptions};
+use recording::plans::{self, Exchange, Plans};
+use recording::{Episode, ReadError};
+use std::io::Cursor;
+use std::time::Duration;
+use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
+use wire::planner::{Goal, PlanRequest, PlanResponse, StageTimes};
+use wire::replay::PlannedEpisode;
+use wire::sim::Variation;
+use wire::{Image, Position};
+
+fuzz_target!(init: fuzz::seed("recording", recordings(), check), |input: &[u8]| {
+    let _ = check(input);
+});
+
+fn check(input: &[u8]) -> Result<(), ReadError> {
+    let demonstration = survives(input, recording::from_bytes, recording::to_bytes);
+    demonstration.or_else(|_| survives(input, plans::from_bytes, plans::to_bytes))
+}
+
+/// Compares bytes, since some plans may hold what is not a number.
+fn survives<T>(
+    input: &[u8],
+    read: fn(&[u8]) -> Result<T, ReadError>,
+    write: fn(&T) -> Result<Vec<u8>, McapError>,
+) -> Result<(), ReadError> {
+    let copy = write(&read(input)?).expect("what was read can be written");
+    let same = read(&copy).expect("what was written can be read");
+    assert_eq!(write(&same).expect("what was read can be written"), copy);
+    Ok(())
+}
+
+/// Recordings as they are written, and copies, whose parts can be changed without spoiling a checksum.
+fn recordings() -> Vec<Vec<u8>> {
+    let demonstration = recording::to_bytes(&demonstration()).expect("an episode can be written");
+    let plans = plans::to_bytes(&plans()).expect("plans can be written");
+    [demonstration, plans]
+        .into_iter()
+        .flat_map(|whole| [flat(&whole), chunked(&whole), compressed(&whole), whole])
+        .collect()
+}
+
+fn flat(recording: &[u8]) -> Vec<u8> {
+    copy(recording, WriteOptions::new().use_chunks(false))
+}
+
+fn chunked(recording: &[u8]) -> Vec<u8> {
+    copy(recording, WriteOptions::new().compression(None))
+}
+
+fn compressed(recording: &[u8]) -> Vec<u8> {
+    copy(recording, WriteOptions::new().compression(Some(Compression::Zstd)))
+}
+
+fn copy(recording: &[u8], options: WriteOptions) -> Vec<u8> {
+    let options = options.calculate_chunk_crcs(false).calculate_data_section_crc(false);
+    let options = options.calculate_summary_section_crc(false).emit_summary_records(false);
+    let mut writer = options.create(Cursor::new(Vec::new())).expect("a writer");
+    for message in MessageStream::new(recording).expect("a recording") {
+        let Message { channel, sequence, log_time, publish_time, data } = message.expect("a message");
+        let schema = channel.schema.as_ref().expect("a schema");
+        // What the schema says is not read here, and would be most of the file.
+        let schema = writer.add_schema(&schema.name, &schema.encoding, &[]).expect("a schema");
+        let encoding = &channel.message_encoding;
+        let channel_id = writer.add_channel(schema, &channel.topic, encoding, &channel.metadata).expect("a channel");
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time };
+        writer.write_to_known_channel(&header, &data).expect("a vector takes all bytes");
+    }
+    writer.finish().expect("a vector takes all bytes");
+    writer.into_inner().into_inner()
+}
+
+fn demonstration() -> Episode {
+    let step = |step: u32| DemonstrationStep {
+        episode_id: "reach-5".into(),
+        step,
+        frame: Image::new(1, 2, vec![step as u8; 6]).expect("an image"),
+        action: (step < 2).then(|| vec![0.25, -1.0]),
+        state: vec![0.5],
+        reward: 1.0,
+        success: step == 2,
+    };
+    let steps: Vec<_> = (0..3).map(step).collect();
+    let info = RecordedEpisode {
+        episode_id: "reach-5".into(),
+        variation: variation(),
+        steps: 3,
+        digest: digest(&steps),
+        goal_position: vec![0.0, 0.5, 0.25],
+        control_hz: 80.0,
+        render_spec: String::new(),
+    };
+    Episode::new(info, steps).expect("an episode")
+}
+
+fn plans() -> Plans {
+    let position = Position::new([0.5, -0.25, 0.125]).expect("a position");
+    let model_digest = "0".repeat(64);
+    let response = PlanResponse {
+        actions: vec![vec![0.25, -1.0]; 2],
+        first_action: vec![0.25, -1.0],
+        inner_losses: vec![0.5, 0.25],
+        latent_distance: Some(1.5),
+        times: StageTimes { queue_seconds: 0.1, encode_seconds: 0.2, plan_seconds: 0.3 },
+        model_digest: model_digest.clone(),
+        goal_id: "0".repeat(64),
+        iterations: 1,
+        iterations_run: 1,
+        warm_start: Vec::new(),
+    };
+    let exchange = Exchange {
+        request: PlanRequest::new("cpn", Goal::Position(position), position.into()),
+        asked: Duration::from_millis(1),
+        response,
+        answered: Duration::from_millis(2),
+    };
+    let (variation, model, goal) = (variation(), "cpn".into(), position.into());
+    let episode = PlannedEpisode { variation, model, model_digest, goal, plans: 2 };
+    Plans::new(episode, vec![exchange; 2]).expect("plans that fit together")
+}
+
+fn variation() -> Variation {
+    Variation { task: "reach".into(), seed: 5 }
+}

@@ -1,0 +1,13 @@
+#!/usr/bin/env bash
+# Feeds each decoder what a stranger may send, for MINUTES each. An input that breaks one is kept in fuzz/artifacts.
+set -euo pipefail
+cd "$(dirname "$0")/../fuzz"
+
+broken=()
+for fuzzer in messages checkpoint recording openpi; do
+    echo "== $fuzzer"
+    mkdir -p "artifacts/$fuzzer"
+    cargo run --quiet --release --locked --bin "$fuzzer" -- "corpus/$fuzzer" -artifact_prefix="artifacts/$fuzzer/" \
+        -max_total_time=$((${MINUTES:-10} * 60)) -timeout=10 -rss_limit_mb=1024 -print_final_stats=1 || broken+=("$fuzzer")
+done
+[[ ${#broken[@]} -eq 0 ]] || { echo "broken: ${broken[*]}" >&2; exit 1; }
