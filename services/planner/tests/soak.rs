@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{checkpoint, from_bytes, image, plan_request};
+use common::{Process, checkpoint, from_bytes, image, plan_request};
 use cpn::MethodKind;
 use prost::Message as _;
 use rand::{RngExt, SeedableRng};
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use service_kit::SessionConfig;
 use std::collections::BTreeMap;
 use std::net::TcpListener;
-use std::process::{Child, Command};
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -30,22 +30,11 @@ const TIMEOUT: Duration = Duration::from_secs(30);
 /// Between the first tenth of the long run and its end.
 const MOST_GROWTH_BYTES: u64 = 20 << 20;
 
-struct Process(Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-impl Process {
-    /// Memory in use, in bytes.
-    fn resident_bytes(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.0.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with("VmRSS")).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
-    }
+/// Memory that a process uses, in bytes.
+fn resident_bytes(process: &Process) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", process.0.id())).unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
 }
 
 /// What every client has.
@@ -199,7 +188,7 @@ async fn soak(duration: Duration) -> (u64, u64) {
     while !clients.is_empty() {
         tokio::select! {
             _ = tick.tick() => {
-                let bytes = planner.resident_bytes();
+                let bytes = resident_bytes(&planner);
                 if begun.elapsed() * 10 > duration {
                     early.get_or_insert(bytes);
                 }
@@ -212,7 +201,7 @@ async fn soak(duration: Duration) -> (u64, u64) {
     for (kind, count) in &*load.done {
         assert!(count.load(Ordering::Relaxed) > 2, "{kind}: next to nothing was done");
     }
-    (early.unwrap(), planner.resident_bytes())
+    (early.unwrap(), resident_bytes(&planner))
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{PATIENCE, plan_request};
+use common::{PATIENCE, Process, plan_request};
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{TraceService, TraceServiceServer};
 use opentelemetry_proto::tonic::collector::trace::v1::{ExportTraceServiceRequest, ExportTraceServiceResponse};
 use opentelemetry_proto::tonic::trace::v1::Span;
@@ -12,7 +12,7 @@ use planner::model::RANDOM;
 use prost::Message as _;
 use service_kit::SessionConfig;
 use std::net::TcpListener;
-use std::process::{Child, Command};
+use std::process::Command;
 use tokio::sync::mpsc;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
@@ -33,15 +33,6 @@ impl TraceService for Collector {
         let scopes = request.into_inner().resource_spans.into_iter().flat_map(|resource| resource.scope_spans);
         scopes.flat_map(|scope| scope.spans).for_each(|span| self.0.send(span).unwrap());
         Ok(Response::new(ExportTraceServiceResponse::default()))
-    }
-}
-
-struct Process(Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 

@@ -13,6 +13,7 @@ use planner::{Config, Planner};
 use prost::Message as _;
 use service_kit::SessionConfig;
 use std::future::Future;
+use std::process::Child;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
@@ -77,6 +78,16 @@ impl Fixture {
             Client::Grpc(PlannerServiceClient::new(self.channel.clone())),
             Client::Zenoh(self.session.clone()),
         ]
+    }
+}
+
+/// A planner in a process of its own, which ends when this is dropped.
+pub struct Process(pub Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 
