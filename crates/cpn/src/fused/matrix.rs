@@ -4,17 +4,17 @@
 use super::lanes::Lanes;
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
+use std::array;
 use std::marker::PhantomData;
 
 /// Registers side by side in a panel.
 const REGISTERS: usize = 2;
-/// Rows that are multiplied at once, as many as there are registers for.
-const ROWS: usize = 8;
 /// Panels that a single row is multiplied by at once: enough sums side by side that none waits for the one before.
 const PANELS: usize = 4;
-
 /// Numbers of a single row that are looked through at once for zeros.
 const CHUNK: usize = 64;
+/// More numbers than any panel is wide.
+const WIDEST: usize = 64;
 
 /// b of a product, `[inner, columns]`, in panels of as many columns as fill some registers.
 #[derive(Debug, Clone, Copy)]
@@ -109,14 +109,16 @@ impl<T: Real> WithSimd for Product<'_, T> {
         let rows = self.c.len() / columns;
         assert!(self.a.len() == rows * inner && self.c.len() == rows * columns, "shapes of a product");
         let panels = columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
-        let whole = rows - rows % ROWS;
-        for panel in 0..panels {
-            for row in (0..whole).step_by(ROWS) {
-                self.tile::<S, ROWS, 1>(simd, panel, row);
-            }
+        // As many rows at once as there are registers for their sums, a part of b and a number of a.
+        let mut row = 0;
+        if S::REGISTER_COUNT >= 32 {
+            row = self.tiles::<S, 8>(simd, panels, row, rows);
         }
-        // A few rows by themselves are bound by how fast b can be read.
-        for row in whole..rows {
+        row = self.tiles::<S, 6>(simd, panels, row, rows);
+        row = self.tiles::<S, 4>(simd, panels, row, rows);
+        row = self.tiles::<S, 2>(simd, panels, row, rows);
+        // A row by itself is bound by how fast b can be read.
+        for row in row..rows {
             let wide = panels - panels % PANELS;
             for panel in (0..wide).step_by(PANELS) {
                 self.tile::<S, 1, PANELS>(simd, panel, row);
@@ -129,16 +131,29 @@ impl<T: Real> WithSimd for Product<'_, T> {
 }
 
 impl<T: Real> Product<'_, T> {
+    /// As many tiles of R rows as there are from `row` on; answers the row after them.
+    #[inline(always)]
+    fn tiles<S: Simd, const R: usize>(&mut self, simd: S, panels: usize, row: usize, rows: usize) -> usize {
+        let end = row + (rows - row) / R * R;
+        for panel in 0..panels {
+            for row in (row..end).step_by(R) {
+                self.tile::<S, R, 1>(simd, panel, row);
+            }
+        }
+        end
+    }
+
     /// R rows of c, from `row` on, at P panels, from `panel` on.
     #[inline(always)]
     fn tile<S: Simd, const R: usize, const P: usize>(&mut self, simd: S, panel: usize, row: usize) {
         let Matrix { inner, columns, stride, apart, values } = self.b;
-        let b: [&[T]; P] = std::array::from_fn(|p| &values[(panel + p) * apart..]);
+        let b: [&[T]; P] = array::from_fn(|p| &values[(panel + p) * apart..]);
         let sums = if self.turned {
             let rows = self.a.len() / inner;
-            sums::<S, T, R, P>(simd, inner, |r, k| self.a[k * rows + row + r], (b, stride))
+            let a = &self.a[row..];
+            sums::<S, T, R, P>(simd, inner, |r, k| a[k * rows + r], (b, stride))
         } else {
-            let a: [&[T]; R] = std::array::from_fn(|r| &self.a[(row + r) * inner..][..inner]);
+            let a: [&[T]; R] = array::from_fn(|r| &self.a[(row + r) * inner..][..inner]);
             sums::<S, T, R, P>(simd, inner, |r, k| a[r][k], (b, stride))
         };
         let count = Lanes::<S, T>::COUNT;
@@ -155,7 +170,7 @@ impl<T: Real> Product<'_, T> {
     }
 }
 
-/// Along the inner dimension: R rows of a times P panels of b, whose rows are `stride` apart.
+/// Along the inner dimension: R rows of a, whose k-th numbers `a` answers, times P panels of b, whose rows are `stride` apart.
 #[inline(always)]
 fn sums<S: Simd, T: Real, const R: usize, const P: usize>(
     simd: S,
@@ -165,11 +180,19 @@ fn sums<S: Simd, T: Real, const R: usize, const P: usize>(
 ) -> [[[Lanes<S, T>; REGISTERS]; P]; R] {
     let count = Lanes::<S, T>::COUNT;
     let mut sums = [[[Lanes::splat(simd, T::ZERO); REGISTERS]; P]; R];
+    let mut padded = [T::ZERO; WIDEST];
     let mut add = |k: usize| {
         for p in 0..P {
-            let line = &b[p][k * stride..];
-            let b: [_; REGISTERS] =
-                std::array::from_fn(|i| Lanes::load(simd, line.get(i * count..).unwrap_or_default()));
+            let rest = &b[p][k * stride..];
+            let line = match rest.get(..REGISTERS * count) {
+                Some(line) => line,
+                // Past the end of b's last row there may be nothing to fill the registers with.
+                None => {
+                    padded[..rest.len()].copy_from_slice(rest);
+                    &padded[..REGISTERS * count]
+                }
+            };
+            let b: [_; REGISTERS] = array::from_fn(|i| Lanes::load(simd, &line[i * count..][..count]));
             for (r, sums) in sums.iter_mut().enumerate() {
                 let a = Lanes::splat(simd, a(r, k));
                 for (sum, b) in sums[p].iter_mut().zip(b) {
