@@ -2,11 +2,37 @@
 
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::{images, positions};
+use serde::{Deserialize, Serialize};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
 
-/// The kind that the processor multiplies fastest.
-const HALF: Kind = Kind::BFloat16;
+/// What images are embedded in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// As everywhere else.
+    Float32,
+    /// Twice as fast where the processor multiplies it, and close; many times slower where it does not.
+    Bfloat16,
+}
+
+impl Precision {
+    /// The same, or float32 where the processor does not multiply it.
+    pub fn where_multiplied(self) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        let multiplied = is_x86_feature_detected!("avx512bf16");
+        #[cfg(target_arch = "aarch64")]
+        let multiplied = std::arch::is_aarch64_feature_detected!("bf16");
+        if multiplied { self } else { Self::Float32 }
+    }
+
+    fn kind(self) -> Kind {
+        match self {
+            Self::Float32 => Kind::Float,
+            Self::Bfloat16 => Kind::BFloat16,
+        }
+    }
+}
 
 /// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]
@@ -48,10 +74,11 @@ impl Encoder {
         self.normalise(self.linear.forward(&self.body.features(input, self.kind())))
     }
 
-    /// The same, with the convolutions and the linear layer on images computed in bfloat16: weights, sums and what comes
-    /// after stay in float32. Positions are embedded as ever.
-    pub fn encode_in_bfloat16(&self, input: &Tensor) -> Tensor {
+    /// The same for weights in float32, in the order of sums that the library is fastest with. In bfloat16 the convolutions and
+    /// the linear layer on images multiply; weights, sums and what comes after stay in float32. Positions are embedded as ever.
+    pub fn encode_fast(&self, input: &Tensor, precision: Precision) -> Tensor {
         let Body::Image { convolutions } = &self.body else { return self.encode(input) };
+        let kind = precision.kind();
         let mut y = Tensor::new();
         for (i, Convolution { layer, stride }) in convolutions.iter().enumerate() {
             let bias = layer.bs.as_ref().expect("built with a bias");
@@ -59,20 +86,20 @@ impl Encoder {
                 // Whole numbers up to 255 are exact in bfloat16, so that the weights take on the scaling of the pixels:
                 // w (p / 255 - 1/2) + b = (w / 255) p + (b - Σw / 2).
                 let sums = layer.ws.sum_dim_intlist([1, 2, 3].as_slice(), false, None::<Kind>);
-                let (blocks, weight, stride) = in_blocks(input, &(&layer.ws / 255.0), *stride);
+                let (blocks, weight, stride) = in_blocks(input, kind, &(&layer.ws / 255.0), *stride);
                 y = blocks;
                 (weight, bias - sums / 2.0, stride)
             } else {
                 (layer.ws.shallow_clone(), bias.shallow_clone(), *stride)
             };
-            let weight = channels_last(&weight.to_kind(HALF));
-            y = y.conv2d(&weight, Some(bias.to_kind(HALF)), [stride; 2], [0, 0], [1, 1], 1).relu_();
+            let weight = channels_last(&weight.to_kind(kind));
+            y = y.conv2d(&weight, Some(bias.to_kind(kind)), [stride; 2], [0, 0], [1, 1], 1).relu_();
         }
         // The features lie with their channels last; the weights are turned rather than them.
         let (_, channels, size, _) = y.size4().expect("a batch of feature maps");
         let weight = self.linear.ws.view([-1, channels, size, size]).permute([0, 2, 3, 1]).flatten(1, -1);
         let features = y.permute([0, 2, 3, 1]).flatten(1, -1);
-        let x = features.matmul(&weight.to_kind(HALF).tr()).to_kind(Kind::Float);
+        let x = features.matmul(&weight.to_kind(kind).tr()).to_kind(Kind::Float);
         self.normalise(x + self.linear.bs.as_ref().expect("built with a bias"))
     }
 
@@ -89,18 +116,18 @@ impl Encoder {
     }
 }
 
-/// Images `[B, 84, 84, 3]` as bfloat16 `[B, C, S, S]`, for a convolution with weights `[O, C, K, K]`, and its stride.
+/// Images `[B, 84, 84, 3]` as numbers `[B, C, S, S]`, for a convolution with weights `[O, C, K, K]`, and its stride.
 ///
 /// With the stride of the paper's first convolution, and a kernel that its blocks cut evenly, these become channels: the
 /// same sums as a convolution of stride 1 with many channels, which the library computes far faster than one with three.
-fn in_blocks(images: &Tensor, weight: &Tensor, stride: i64) -> (Tensor, Tensor, i64) {
+fn in_blocks(images: &Tensor, kind: Kind, weight: &Tensor, stride: i64) -> (Tensor, Tensor, i64) {
     let (outputs, channels, kernel, _) = weight.size4().expect("the weight of a convolution");
     if stride != images::BLOCK || kernel % stride != 0 {
-        return (images.permute([0, 3, 1, 2]).to_kind(HALF), weight.shallow_clone(), stride);
+        return (images.permute([0, 3, 1, 2]).to_kind(kind), weight.shallow_clone(), stride);
     }
     let (count, side) = (kernel / stride, images::SIZE / stride);
     let weight = weight.view([outputs, channels, count, stride, count, stride]).permute([0, 3, 5, 1, 2, 4]);
-    let blocks = images::blocks(images).view([-1, side, side, stride * stride * channels]);
+    let blocks = images::blocks(images, kind).view([-1, side, side, stride * stride * channels]);
     (blocks.permute([0, 3, 1, 2]), weight.reshape([outputs, -1, count, count]), 1)
 }
 

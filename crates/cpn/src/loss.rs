@@ -1,8 +1,8 @@
 //! The outer loop: behaviour cloning of the planned actions, through the inner loop.
 
 use crate::agent::Agent;
+use crate::encoder::Precision;
 use crate::fused::{self, OuterLoop, Samples, Variables, floats};
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::Instant;
 use tch::{Kind, Tensor};
@@ -28,16 +28,6 @@ pub fn behaviour_cloning(planned: &Tensor, demonstrated: &Tensor, mask: &Tensor)
     let actions = planned.size()[2] as f64;
     let squared = (planned - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);
     (squared * mask).sum(None::<Kind>) / (mask.sum(None::<Kind>) * actions)
-}
-
-/// What the encoder computes in while training.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Precision {
-    /// As everywhere else.
-    Float32,
-    /// Twice as fast where the processor multiplies it, and close ([`crate::encoder::Encoder::encode_in_bfloat16`]).
-    Bfloat16,
 }
 
 /// An outer loss and what it changes by when the weights do.
@@ -68,10 +58,7 @@ impl OuterLoss {
     /// makes of [`Agent::outer_loss`].
     pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
         let started = Instant::now();
-        let embeddings = match self.precision {
-            Precision::Float32 => agent.encoder().encode(&batch.frames),
-            Precision::Bfloat16 => agent.encoder().encode_in_bfloat16(&batch.frames),
-        };
+        let embeddings = agent.encoder().encode_fast(&batch.frames, self.precision);
         let values = floats(&embeddings.detach());
         let encoding = started.elapsed();
         let latent = embeddings.size()[1] as usize;

@@ -5,7 +5,8 @@
 mod common;
 
 use common::{noise_images, uniform};
-use cpn::loss::{Batch, OuterLoss, Precision};
+use cpn::encoder::Precision;
+use cpn::loss::{Batch, OuterLoss};
 use cpn::{Agent, MethodKind, ModelConfig};
 use tch::{Kind, Tensor};
 

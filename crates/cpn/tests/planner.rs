@@ -5,9 +5,9 @@
 mod common;
 
 use common::{double_agent, noise_images, position_config, small_config, uniform};
+use cpn::encoder::Precision;
 use cpn::images;
 use cpn::inner_loop::TensorPlan;
-use cpn::loss::Precision;
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Planner, Random};
 use proptest::prelude::*;

@@ -4,7 +4,7 @@
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
 use clap::Parser;
-use cpn::loss::Precision;
+use cpn::encoder::Precision;
 use cpn::method::{Iterations, Observed, Query, Solver};
 use cpn::{Method, checkpoint};
 use futures::future::join_all;

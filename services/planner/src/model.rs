@@ -2,7 +2,7 @@
 
 use crate::task::PlanTask;
 use cpn::checkpoint::{self, Checkpoint, Provenance};
-use cpn::loss::Precision;
+use cpn::encoder::Precision;
 use cpn::method::{self, Iterations, Observed, Query};
 use cpn::{Input, Method, Plan, Planner, Random, images};
 use service_kit::files;

@@ -10,7 +10,7 @@ mod common;
 
 use clap::Parser;
 use cpn::archive::{self, Tensors};
-use cpn::loss::Precision;
+use cpn::encoder::Precision;
 use cpn::{Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
 use serde_json::json;
 use std::io::{self, BufRead};

@@ -9,8 +9,8 @@ use super::sampling;
 use super::{BLOCK, Variables, floats};
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
+use crate::encoder::Precision;
 use crate::images;
-use crate::loss::Precision;
 use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
 use rayon::prelude::*;
 
@@ -256,7 +256,7 @@ fn in_bfloat16(agent: &Agent, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         Observed::Position(_) => panic!("observations are checked as they arrive"),
     });
     let images = images::from_bytes(&bytes.copied().collect::<Vec<_>>()).expect("whole images, and at least one");
-    let embeddings = floats::<f32>(&tch::no_grad(|| agent.encoder().encode_in_bfloat16(&images)));
+    let embeddings = floats::<f32>(&tch::no_grad(|| agent.encoder().encode_fast(&images, Precision::Bfloat16)));
     embeddings.chunks_exact(embeddings.len() / inputs.len()).map(<[f32]>::to_vec).collect()
 }
 
