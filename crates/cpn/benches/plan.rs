@@ -20,6 +20,7 @@ use std::time::Instant;
 /// Distinct observations, over and over.
 const FRAMES: usize = 64;
 const SEED: u64 = 0;
+const DAMPING: f64 = 0.1;
 
 #[derive(Parser)]
 struct Args {
@@ -74,6 +75,15 @@ fn write(path: &PathBuf, args: &Args) {
         Some(path) => checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent,
         None => Agent::new(config, SEED),
     };
+    if args.checkpoint.is_none() {
+        // The steps that an untrained model predicts are so large that a plan longer than the paper's would be chaos, in which
+        // no two programs agree.
+        for (name, mut weight) in agent.variables().variables() {
+            if name.starts_with("network.dynamics_1.") {
+                let _ = tch::no_grad(|| weight.g_mul_scalar_(DAMPING));
+            }
+        }
+    }
     let noise = |seed| {
         let mut bytes = vec![0; FRAMES * images::BYTES];
         ChaCha8Rng::seed_from_u64(seed).fill(bytes.as_mut_slice());
