@@ -80,3 +80,9 @@ fn agrees_with_autograd() {
         }
     }
 }
+
+/// At full size a block's gates come in several parts; 33 outputs leave a smaller last one.
+#[test]
+fn gates_in_parts_agree_with_autograd() {
+    check(ModelConfig { horizon: 2, hidden: 33, ..ModelConfig::paper(MethodKind::Cpn) }, 20, 1);
+}

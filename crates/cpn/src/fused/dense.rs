@@ -1,8 +1,7 @@
 //! A layer of g_θ, plain or neuromodulated, and its four passes over a block of R samples.
 
-use super::Scratch;
 use super::gate::GateGradient;
-use super::gated::{Gated, GatesGradient, GatesTape};
+use super::gated::{Gated, GatesGradient, GatesTape, Scratch};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
 
@@ -126,7 +125,7 @@ impl<T: Real> Dense<T> {
         let (x, y_bar) = (&tape.x[..rows * tape.inputs], &tape.y[rows * tape.outputs..2 * rows * tape.outputs]);
         match (self, &mut tape.gates) {
             (Self::Gated(gated), Some(gates)) => gated.backward(rows, (x, y_bar), gates, scratch, x_bar),
-            _ => self.linear().backward(y_bar, x_bar),
+            _ => self.linear().backward(self.linear().all(), y_bar, x_bar),
         }
     }
 
@@ -135,7 +134,7 @@ impl<T: Real> Dense<T> {
         let x = &tape.x[..2 * rows * tape.inputs];
         match (self, &mut tape.gates) {
             (Self::Gated(gated), Some(gates)) => gated.tangent(rows, x, gates, y_dot),
-            _ => self.linear().tangent(&x[rows * tape.inputs..], y_dot),
+            _ => self.linear().tangent(self.linear().all(), &x[rows * tape.inputs..], y_dot),
         }
     }
 
@@ -156,8 +155,8 @@ impl<T: Real> Dense<T> {
                 gated.adjoint(rows, (x, y), gates, scratch, x_hat, (&mut gradient.linear, in_gates));
             }
             _ => {
-                self.linear().accumulate(rows, (x, y), &mut gradient.linear);
-                self.linear().backward(&y[..rows * tape.outputs], x_hat);
+                self.linear().accumulate(self.linear().all(), rows, (x, y), &mut gradient.linear);
+                self.linear().backward(self.linear().all(), &y[..rows * tape.outputs], x_hat);
             }
         }
     }

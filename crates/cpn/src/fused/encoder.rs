@@ -2,7 +2,8 @@
 
 use super::gate::rectify;
 use super::linear::{Linear, Weights};
-use super::matrix::{Panels, multiply};
+use super::matrix::Panels;
+use super::product::{Left, multiply};
 use super::real::Real;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::images::{CHANNELS, SIZE};
@@ -30,9 +31,10 @@ enum Body<T> {
 /// A convolution over an image whose channels lie together, `[S, S, C]`, and a rectified linear unit.
 #[derive(Debug)]
 struct Convolution<T> {
-    kernel: usize,
-    stride: usize,
-    channels: usize,
+    /// Where each of the patches begins, `[S' S']`.
+    starts: Vec<usize>,
+    /// Where its numbers lie from there on, `[K K C]`.
+    places: Vec<usize>,
     /// `[K K C, O]`.
     weight: Panels<T>,
     /// `[O]`.
@@ -51,7 +53,8 @@ struct Norm<T> {
 pub struct Room<T> {
     x: Vec<T>,
     y: Vec<T>,
-    patches: Vec<T>,
+    /// Of all inputs, `[R, F]`.
+    features: Vec<T>,
 }
 
 impl<T: Real> Encoder<T> {
@@ -72,29 +75,32 @@ impl<T: Real> Encoder<T> {
         }
     }
 
-    /// Embeds an image of 84 x 84 or a position, whichever it takes, as `[Z]`.
-    pub fn encode(&self, input: Observed<'_>, room: &mut Room<T>) -> Vec<T> {
-        self.body.features(input, room);
-        let mut embedding = vec![T::ZERO; self.linear.outputs];
-        self.linear.forward(&room.x, &mut embedding);
-        if let Some(norm) = &self.norm {
-            norm.apply(&mut embedding);
+    /// Embeds images of 84 x 84 or positions, whichever it takes, as `[Z]` each.
+    pub fn encode(&self, inputs: &[Observed<'_>], room: &mut Room<T>) -> Vec<Vec<T>> {
+        room.features.clear();
+        for input in inputs {
+            self.body.features(*input, room);
+            room.features.extend_from_slice(&room.x);
         }
-        embedding
+        let mut embeddings = vec![T::ZERO; inputs.len() * self.linear.outputs];
+        self.linear.forward(&room.features, &mut embeddings);
+        if let Some(norm) = &self.norm {
+            embeddings.chunks_exact_mut(self.linear.outputs).for_each(|embedding| norm.apply(embedding));
+        }
+        embeddings.chunks_exact(self.linear.outputs).map(<[T]>::to_vec).collect()
     }
 }
 
 impl<T: Real> Body<T> {
     /// The convolutions, and the channels of the last one.
     fn image(config: &ImageEncoderConfig, weights: &impl Weights<T>) -> (Self, usize) {
-        let mut channels = CHANNELS as usize;
+        let (mut side, mut channels) = (SIZE as usize, CHANNELS as usize);
         let mut convolutions = Vec::new();
         for (i, conv) in config.convolutions.iter().enumerate() {
             let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
             let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
-            let weight = Panels::transposed(&turn(&weight, channels, kernel * kernel), kernel * kernel * channels);
-            convolutions.push(Convolution { kernel, stride, channels, weight, bias });
-            channels = conv.channels as usize;
+            convolutions.push(Convolution::new((side, channels), (kernel, stride), &weight, bias));
+            (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
         }
         (Self::Image { convolutions }, channels)
     }
@@ -115,9 +121,8 @@ impl<T: Real> Body<T> {
             (Self::Image { convolutions }, Observed::Image(bytes)) => {
                 room.x.resize(bytes.len(), T::ZERO);
                 Arch::new().dispatch(Scale { bytes, x: &mut room.x });
-                let mut side = SIZE as usize;
                 for convolution in convolutions {
-                    side = convolution.forward(side, room);
+                    convolution.forward(room);
                     std::mem::swap(&mut room.x, &mut room.y);
                 }
             }
@@ -138,22 +143,27 @@ impl<T: Real> Body<T> {
 }
 
 impl<T: Real> Convolution<T> {
-    /// `room.x`, `[S, S, C]`, to `room.y`, `[S', S', O]`; answers S'.
-    fn forward(&self, side: usize, room: &mut Room<T>) -> usize {
-        let Self { kernel, stride, channels, .. } = *self;
-        let Room { x, y, patches } = room;
+    /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`.
+    fn new((side, channels): (usize, usize), (kernel, stride): (usize, usize), weight: &[T], bias: Vec<T>) -> Self {
         let size = (side - kernel) / stride + 1;
-        patches.clear();
-        for (top, left) in (0..size).flat_map(|top| (0..size).map(move |left| (top * stride, left * stride))) {
-            for row in top..top + kernel {
-                patches.extend_from_slice(&x[(row * side + left) * channels..][..kernel * channels]);
-            }
+        let starts = (0..size).flat_map(|top| (0..size).map(move |left| (top * side + left) * stride * channels));
+        let places = (0..kernel).flat_map(|row| (0..kernel * channels).map(move |at| row * side * channels + at));
+        Self {
+            starts: starts.collect(),
+            places: places.collect(),
+            weight: Panels::transposed(&turn(weight, channels, kernel * kernel), kernel * kernel * channels),
+            bias,
         }
+    }
+
+    /// `room.x`, `[S, S, C]`, to `room.y`, `[S', S', O]`.
+    fn forward(&self, room: &mut Room<T>) {
+        let Room { x, y, .. } = room;
         y.clear();
-        (0..size * size).for_each(|_| y.extend_from_slice(&self.bias));
-        multiply(true, y, patches, self.weight.matrix());
+        self.starts.iter().for_each(|_| y.extend_from_slice(&self.bias));
+        let patches = Left::Patches { image: x, starts: &self.starts, places: &self.places };
+        multiply(true, y, patches, self.weight.matrix(0..self.bias.len()));
         rectify(y);
-        size
     }
 }
 
@@ -169,9 +179,9 @@ impl<T: Real> WithSimd for Scale<'_, T> {
     // Nothing here names a register; the compiler finds them, as wide as the dispatch says there are.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
-        let half = T::ONE / T::count(2);
+        let (step, half) = (T::ONE / T::count(255), T::ONE / T::count(2));
         for (x, byte) in self.x.iter_mut().zip(self.bytes) {
-            *x = T::from_u8(*byte) / T::count(255) - half;
+            *x = T::from_u8(*byte) * step - half;
         }
     }
 }

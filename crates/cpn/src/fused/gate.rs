@@ -1,8 +1,9 @@
 //! u_β or v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to the [layer that is
-//! attenuated](super::gated), which runs over the same numbers anyway.
+//! attenuated](super::gated), which runs over the same numbers anyway, and asks for them part by part.
 
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
+use std::ops::Range;
 
 /// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁).
 #[derive(Debug)]
@@ -22,28 +23,23 @@ pub struct GateGradient<T> {
 #[derive(Debug)]
 pub struct GateTape<T> {
     width: usize,
-    outputs: usize,
     /// h and ḣ, `[2 R, width]`.
     h: Vec<T>,
     /// ĥ and h̄, `[2 R, width]`.
     h_adjoint: Vec<T>,
-    /// First s - b₂, then σ(s), `[R, outputs]`.
+    /// First s - b₂, then σ(s): for each part `[R, its outputs]`.
     out: Vec<T>,
-    /// ṡ, `[R, outputs]`.
+    /// ṡ, likewise.
     s_dot: Vec<T>,
 }
 
 impl<T: Real> GateTape<T> {
-    pub fn out(&self, rows: usize) -> &[T] {
-        &self.out[..rows * self.outputs]
+    pub fn out(&self, rows: usize, part: &Range<usize>) -> &[T] {
+        &self.out[rows * part.start..rows * part.end]
     }
 
-    pub fn out_mut(&mut self, rows: usize) -> &mut [T] {
-        &mut self.out[..rows * self.outputs]
-    }
-
-    pub fn s_dot(&self, rows: usize) -> &[T] {
-        &self.s_dot[..rows * self.outputs]
+    pub fn s_dot(&self, rows: usize, part: &Range<usize>) -> &[T] {
+        &self.s_dot[rows * part.start..rows * part.end]
     }
 }
 
@@ -60,65 +56,100 @@ impl<T: Real> Gate<T> {
     pub fn tape(&self, rows: usize) -> GateTape<T> {
         let (width, outputs) = (self.hidden.outputs, self.output.outputs);
         let zeros = |size| vec![T::ZERO; rows * size];
-        GateTape {
-            width,
-            outputs,
-            h: zeros(2 * width),
-            h_adjoint: zeros(2 * width),
-            out: zeros(outputs),
-            s_dot: zeros(outputs),
-        }
+        GateTape { width, h: zeros(2 * width), h_adjoint: zeros(2 * width), out: zeros(outputs), s_dot: zeros(outputs) }
     }
 
-    /// b₂, `[outputs]`.
-    pub fn bias(&self) -> &[T] {
-        self.output.bias()
+    /// All that it attenuates.
+    pub fn all(&self) -> Range<usize> {
+        self.output.all()
     }
 
-    /// Leaves s - b₂ of x `[R, inputs]` on the tape: who goes on from there adds b₂ on the way.
-    pub fn forward(&self, rows: usize, x: &[T], tape: &mut GateTape<T>) {
+    /// The fewest outputs whose multiples make parts.
+    pub fn granule(&self) -> usize {
+        self.output.granule()
+    }
+
+    /// b₂ of a part.
+    pub fn bias(&self, part: &Range<usize>) -> &[T] {
+        &self.output.bias()[part.clone()]
+    }
+
+    /// Before any [`Self::forward`]: leaves h of x `[R, inputs]` on the tape.
+    pub fn enter(&self, rows: usize, x: &[T], tape: &mut GateTape<T>) {
         let h = &mut tape.h[..rows * tape.width];
         self.hidden.forward(x, h);
         rectify(h);
-        self.output.tangent(h, &mut tape.out[..rows * tape.outputs]);
     }
 
-    /// Adds to x̄ what s̄ gives.
-    pub fn backward(&self, rows: usize, s_bar: &[T], tape: &mut GateTape<T>, x_bar: &mut [T]) {
-        let size = rows * tape.width;
-        let h_bar = &mut tape.h_adjoint[size..2 * size];
-        h_bar.fill(T::ZERO);
-        self.output.backward(s_bar, h_bar);
-        mask(h_bar, &tape.h[..size]);
-        self.hidden.backward(h_bar, x_bar);
+    /// Leaves s - b₂ on the tape: who goes on from there adds b₂ on the way.
+    pub fn forward<'a>(&self, rows: usize, part: &Range<usize>, tape: &'a mut GateTape<T>) -> &'a mut [T] {
+        let out = &mut tape.out[rows * part.start..rows * part.end];
+        self.output.tangent(part.clone(), &tape.h[..rows * tape.width], out);
+        out
     }
 
-    /// Leaves ṡ of ẋ `[R, inputs]` on the tape.
-    pub fn tangent(&self, rows: usize, x_dot: &[T], tape: &mut GateTape<T>) {
+    /// Before any [`Self::tangent`]: leaves ḣ of ẋ `[R, inputs]` on the tape.
+    pub fn enter_tangent(&self, rows: usize, x_dot: &[T], tape: &mut GateTape<T>) {
         let (h, h_dot) = tape.h[..2 * rows * tape.width].split_at_mut(rows * tape.width);
-        self.hidden.tangent(x_dot, h_dot);
+        self.hidden.tangent(self.hidden.all(), x_dot, h_dot);
         mask(h_dot, h);
-        self.output.tangent(h_dot, &mut tape.s_dot[..rows * tape.outputs]);
     }
 
-    /// Adds to x̂, and to the gradient, what `s`, ŝ and in the second order s̄ after it, gives; `x` likewise holds x and ẋ.
+    /// Leaves ṡ on the tape.
+    pub fn tangent(&self, rows: usize, part: &Range<usize>, tape: &mut GateTape<T>) {
+        let h_dot = &tape.h[rows * tape.width..2 * rows * tape.width];
+        self.output.tangent(part.clone(), h_dot, &mut tape.s_dot[rows * part.start..rows * part.end]);
+    }
+
+    /// Adds up h̄ from s̄ of a part, the first of which begins anew.
+    pub fn backward(&self, rows: usize, part: &Range<usize>, s_bar: &[T], tape: &mut GateTape<T>) {
+        let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
+        if part.start == 0 {
+            h_bar.fill(T::ZERO);
+        }
+        self.output.backward(part.clone(), s_bar, h_bar);
+    }
+
+    /// After every [`Self::backward`]: adds to x̄ what h̄ gives.
+    pub fn leave_backward(&self, rows: usize, tape: &mut GateTape<T>, x_bar: &mut [T]) {
+        let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
+        mask(h_bar, &tape.h[..rows * tape.width]);
+        self.hidden.backward(self.hidden.all(), h_bar, x_bar);
+    }
+
+    /// Adds up ĥ, and adds to the gradient, what `s`, ŝ of a part and in the second order s̄ after it, gives.
     pub fn adjoint(
         &self,
         rows: usize,
-        x: &[T],
+        part: &Range<usize>,
         s: &[T],
+        tape: &mut GateTape<T>,
+        gradient: &mut GateGradient<T>,
+    ) {
+        let stacked = s.len() / part.len() * tape.width;
+        let h_hat = &mut tape.h_adjoint[..rows * tape.width];
+        if part.start == 0 {
+            h_hat.fill(T::ZERO);
+        }
+        self.output.accumulate(part.clone(), rows, (&tape.h[..stacked], s), &mut gradient.output);
+        self.output.backward(part.clone(), &s[..rows * part.len()], h_hat);
+    }
+
+    /// After every [`Self::adjoint`]: adds to x̂, and to the gradient, what ĥ and in the second order h̄ give; `x` holds x and
+    /// likewise ẋ.
+    pub fn leave_adjoint(
+        &self,
+        rows: usize,
+        x: &[T],
         tape: &mut GateTape<T>,
         x_hat: &mut [T],
         gradient: &mut GateGradient<T>,
     ) {
-        let (size, stacked) = (rows * tape.width, s.len() / tape.outputs * tape.width);
-        self.output.accumulate(rows, (&tape.h[..stacked], s), &mut gradient.output);
+        let (size, stacked) = (rows * tape.width, x.len() / self.hidden.inputs * tape.width);
         let h_hat = &mut tape.h_adjoint[..size];
-        h_hat.fill(T::ZERO);
-        self.output.backward(&s[..rows * tape.outputs], h_hat);
         mask(h_hat, &tape.h[..size]);
-        self.hidden.backward(h_hat, x_hat);
-        self.hidden.accumulate(rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
+        self.hidden.backward(self.hidden.all(), h_hat, x_hat);
+        self.hidden.accumulate(self.hidden.all(), rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
     }
 }
 

@@ -10,12 +10,15 @@
 //!
 //! and for v the same with b in place of a and 1 in place of x.
 
-use super::Scratch;
 use super::gate::{Gate, GateGradient, GateTape};
 use super::linear::{Linear, LinearGradient, Weights};
-use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Tangent};
+use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Sigmoid, Tangent};
 use super::real::Real;
 use pulp::Arch;
+use std::ops::Range;
+
+/// Numbers of a part: 32 KB in float32.
+const PART: usize = 1 << 13;
 
 /// The layer's weights.
 #[derive(Debug)]
@@ -30,6 +33,13 @@ pub struct Gated<T> {
 pub struct GatesGradient<T> {
     pub u: GateGradient<T>,
     pub v: GateGradient<T>,
+}
+
+/// Room for ŝ and s̄ of the gates: of a part of u, and of all of v.
+#[derive(Debug, Default)]
+pub struct Scratch<T> {
+    u: Vec<T>,
+    v: Vec<T>,
 }
 
 /// What the passes leave for each other.
@@ -53,13 +63,33 @@ impl<T: Real> Gated<T> {
         GatesTape { u: self.u.tape(rows), v: self.v.tape(rows) }
     }
 
+    /// Outputs whose attenuations stay in the nearest cache from one step of a pass to the next.
+    fn parts(&self, rows: usize) -> impl Iterator<Item = Range<usize>> + use<T> {
+        let Linear { inputs, outputs, .. } = self.linear;
+        let panel = self.u.granule();
+        let least = (1..panel).find(|count| (count * inputs).is_multiple_of(panel)).unwrap_or(panel);
+        let count = (PART / (rows * inputs)).next_multiple_of(least).max(least);
+        (0..outputs).step_by(count).map(move |first| first..outputs.min(first + count))
+    }
+
+    /// The attenuations of weights that belong to some outputs.
+    fn weights(&self, outputs: &Range<usize>) -> Range<usize> {
+        outputs.start * self.linear.inputs..outputs.end * self.linear.inputs
+    }
+
     /// y of x.
     pub fn forward(&self, rows: usize, x: &[T], tape: &mut GatesTape<T>, y: &mut [T]) {
-        self.u.forward(rows, x, &mut tape.u);
-        self.v.forward(rows, x, &mut tape.v);
-        let (u, v) = (tape.u.out_mut(rows), tape.v.out_mut(rows));
-        let (u_bias, v_bias) = (self.u.bias(), self.v.bias());
-        Arch::new().dispatch(Forward { linear: &self.linear, u_bias, v_bias, x, u, v, y });
+        let (linear, v_bias) = (&self.linear, self.v.bias(&self.v.all()));
+        self.u.enter(rows, x, &mut tape.u);
+        self.v.enter(rows, x, &mut tape.v);
+        let v = self.v.forward(rows, &self.v.all(), &mut tape.v);
+        Arch::new().dispatch(Sigmoid { s: v, bias: v_bias });
+        for outputs in self.parts(rows) {
+            let weights = self.weights(&outputs);
+            let u = self.u.forward(rows, &weights, &mut tape.u);
+            let u_bias = self.u.bias(&weights);
+            Arch::new().dispatch(Forward { linear, outputs, u_bias, x, u, v, y });
+        }
     }
 
     /// Adds to x̄ what ȳ gives.
@@ -71,20 +101,35 @@ impl<T: Real> Gated<T> {
         scratch: &mut Scratch<T>,
         x_bar: &mut [T],
     ) {
-        let (s_u, s_v) = scratch.split(rows, self.linear.inputs, self.linear.outputs);
-        let (u, v) = (tape.u.out(rows), tape.v.out(rows));
-        Arch::new().dispatch(Backward { linear: &self.linear, x, u, v, y_bar, x_bar, s_u, s_v });
-        self.u.backward(rows, s_u, &mut tape.u, x_bar);
-        self.v.backward(rows, s_v, &mut tape.v, x_bar);
+        let linear = &self.linear;
+        let s_v = room(&mut scratch.v, rows * linear.outputs);
+        let v = tape.v.out(rows, &self.v.all());
+        for outputs in self.parts(rows) {
+            let weights = self.weights(&outputs);
+            let s_u = room(&mut scratch.u, rows * weights.len());
+            let u = tape.u.out(rows, &weights);
+            Arch::new().dispatch(Backward { linear, outputs, x, u, v, y_bar, x_bar, s_u, s_v });
+            self.u.backward(rows, &weights, s_u, &mut tape.u);
+        }
+        self.v.backward(rows, &self.v.all(), s_v, &mut tape.v);
+        self.u.leave_backward(rows, &mut tape.u, x_bar);
+        self.v.leave_backward(rows, &mut tape.v, x_bar);
     }
 
     /// ẏ of ẋ; `x` holds x and ẋ.
     pub fn tangent(&self, rows: usize, x: &[T], tape: &mut GatesTape<T>, y_dot: &mut [T]) {
-        let (x, x_dot) = x.split_at(rows * self.linear.inputs);
-        self.u.tangent(rows, x_dot, &mut tape.u);
-        self.v.tangent(rows, x_dot, &mut tape.v);
-        let (u, v, s_dot_u, s_dot_v) = (tape.u.out(rows), tape.v.out(rows), tape.u.s_dot(rows), tape.v.s_dot(rows));
-        Arch::new().dispatch(Tangent { linear: &self.linear, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot });
+        let linear = &self.linear;
+        let (x, x_dot) = x.split_at(rows * linear.inputs);
+        self.u.enter_tangent(rows, x_dot, &mut tape.u);
+        self.v.enter_tangent(rows, x_dot, &mut tape.v);
+        self.v.tangent(rows, &self.v.all(), &mut tape.v);
+        let (v, s_dot_v) = (tape.v.out(rows, &self.v.all()), tape.v.s_dot(rows, &self.v.all()));
+        for outputs in self.parts(rows) {
+            let weights = self.weights(&outputs);
+            self.u.tangent(rows, &weights, &mut tape.u);
+            let (u, s_dot_u) = (tape.u.out(rows, &weights), tape.u.s_dot(rows, &weights));
+            Arch::new().dispatch(Tangent { linear, outputs, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot });
+        }
     }
 
     /// Adds to x̂ and to the gradients what ŷ gives. `x` and `y` hold x and ŷ and, in the second order, ẋ and ȳ after them.
@@ -99,27 +144,44 @@ impl<T: Real> Gated<T> {
     ) {
         let linear = &self.linear;
         let Linear { inputs, outputs, .. } = *linear;
-        let (s_u, s_v) = scratch.split(x.len() / inputs, inputs, outputs);
-        let (u, v) = (tape.u.out(rows), tape.v.out(rows));
-        if x.len() == rows * inputs {
-            let x_hat = &mut *x_hat;
-            Arch::new().dispatch(FirstAdjoint { linear, x, u, v, y_hat: y, x_hat, s_u, s_v, gradient });
-        } else {
-            Arch::new().dispatch(SecondAdjoint {
-                linear,
-                x: x.split_at(rows * inputs).into(),
-                u,
-                v,
-                s_dot_u: tape.u.s_dot(rows),
-                s_dot_v: tape.v.s_dot(rows),
-                y: y.split_at(rows * outputs).into(),
-                x_hat,
-                s_u: s_u.split_at_mut(rows * outputs * inputs),
-                s_v: s_v.split_at_mut(rows * outputs),
-                gradient,
-            });
+        let stacked = x.len() / inputs;
+        let s_v = room(&mut scratch.v, stacked * outputs);
+        let v = tape.v.out(rows, &self.v.all());
+        for outputs in self.parts(rows) {
+            let weights = self.weights(&outputs);
+            let s_u = room(&mut scratch.u, stacked * weights.len());
+            let u = tape.u.out(rows, &weights);
+            if stacked == rows {
+                let (x_hat, s_u, s_v, gradient) = (&mut *x_hat, &mut *s_u, &mut *s_v, &mut *gradient);
+                Arch::new().dispatch(FirstAdjoint { linear, outputs, x, u, v, y_hat: y, x_hat, s_u, s_v, gradient });
+            } else {
+                Arch::new().dispatch(SecondAdjoint {
+                    linear,
+                    x: x.split_at(rows * inputs).into(),
+                    u,
+                    v,
+                    s_dot_u: tape.u.s_dot(rows, &weights),
+                    s_dot_v: tape.v.s_dot(rows, &self.v.all()),
+                    y: y.split_at(rows * linear.outputs).into(),
+                    x_hat,
+                    s_u: s_u.split_at_mut(rows * weights.len()),
+                    s_v: s_v.split_at_mut(rows * linear.outputs),
+                    gradient,
+                    outputs,
+                });
+            }
+            self.u.adjoint(rows, &weights, s_u, &mut tape.u, &mut gates.u);
         }
-        self.u.adjoint(rows, x, s_u, &mut tape.u, x_hat, &mut gates.u);
-        self.v.adjoint(rows, x, s_v, &mut tape.v, x_hat, &mut gates.v);
+        self.v.adjoint(rows, &self.v.all(), s_v, &mut tape.v, &mut gates.v);
+        self.u.leave_adjoint(rows, x, &mut tape.u, x_hat, &mut gates.u);
+        self.v.leave_adjoint(rows, x, &mut tape.v, x_hat, &mut gates.v);
     }
+}
+
+/// So much of a memory, which grows if it must.
+fn room<T: Real>(memory: &mut Vec<T>, size: usize) -> &mut [T] {
+    if memory.len() < size {
+        memory.resize(size, T::ZERO);
+    }
+    &mut memory[..size]
 }

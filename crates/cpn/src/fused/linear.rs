@@ -1,9 +1,11 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
 use super::lanes::Lanes;
-use super::matrix::{Matrix, Panels, accumulate_turned, multiply};
+use super::matrix::{Matrix, Panels};
+use super::product::{Left, multiply};
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
+use std::ops::Range;
 
 /// Weights by their names in a checkpoint.
 pub trait Weights<T> {
@@ -50,6 +52,11 @@ impl<T: Real> Linear<T> {
         &self.weight
     }
 
+    /// The fewest outputs of which a multiple may be computed without the others.
+    pub fn granule(&self) -> usize {
+        self.transposed.width()
+    }
+
     /// b `[outputs]`.
     pub fn bias(&self) -> &[T] {
         &self.bias
@@ -60,25 +67,38 @@ impl<T: Real> Linear<T> {
         for row in y.chunks_exact_mut(self.outputs) {
             row.copy_from_slice(&self.bias);
         }
-        multiply(true, y, x, self.transposed.matrix());
+        multiply(true, y, Left::Rows(x), self.transposed.matrix(self.all()));
     }
 
-    /// ẏ = a ẋ: how y changes as x does.
-    pub fn tangent(&self, x_dot: &[T], y_dot: &mut [T]) {
-        multiply(false, y_dot, x_dot, self.transposed.matrix());
+    /// All of its outputs.
+    pub fn all(&self) -> Range<usize> {
+        0..self.outputs
     }
 
-    /// x̄ += aᵀ ȳ: how a loss changes with x, from how it changes with y.
-    pub fn backward(&self, y_bar: &[T], x_bar: &mut [T]) {
-        multiply(true, x_bar, y_bar, Matrix::new(&self.weight, self.inputs));
+    /// ẏ = a ẋ: how some outputs change as x does.
+    pub fn tangent(&self, outputs: Range<usize>, x_dot: &[T], y_dot: &mut [T]) {
+        multiply(false, y_dot, Left::Rows(x_dot), self.transposed.matrix(outputs));
     }
 
-    /// Adds ∂Φ/∂a and ∂Φ/∂b to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold the R rows of x and ŷ and, in the second
-    /// order, those of ẋ and ȳ after them.
-    pub fn accumulate(&self, rows: usize, (x, y): (&[T], &[T]), gradient: &mut LinearGradient<T>) {
-        accumulate_turned(&mut gradient.weight, y, Matrix::new(x, self.inputs));
-        for row in y[..rows * self.outputs].chunks_exact(self.outputs) {
-            add(&mut gradient.bias, row);
+    /// x̄ += aᵀ ȳ: how a loss changes with x, from how it changes with some outputs.
+    pub fn backward(&self, outputs: Range<usize>, y_bar: &[T], x_bar: &mut [T]) {
+        let weight = &self.weight[outputs.start * self.inputs..outputs.end * self.inputs];
+        multiply(true, x_bar, Left::Rows(y_bar), Matrix::new(weight, self.inputs));
+    }
+
+    /// Adds ∂Φ/∂a and ∂Φ/∂b to `gradient`, for Φ = ŷᵀy + ȳᵀẏ over some outputs. `x` and `y` hold the R rows of x and ŷ and,
+    /// in the second order, those of ẋ and ȳ after them.
+    pub fn accumulate(
+        &self,
+        outputs: Range<usize>,
+        rows: usize,
+        (x, y): (&[T], &[T]),
+        gradient: &mut LinearGradient<T>,
+    ) {
+        let weight = &mut gradient.weight[outputs.start * self.inputs..outputs.end * self.inputs];
+        multiply(true, weight, Left::Turned(y), Matrix::new(x, self.inputs));
+        for row in y.chunks_exact(outputs.len()).take(rows) {
+            add(&mut gradient.bias[outputs.clone()], row);
         }
     }
 

@@ -28,6 +28,7 @@ mod modulation;
 mod network;
 mod outer;
 mod planner;
+mod product;
 mod real;
 mod sampling;
 
@@ -46,31 +47,6 @@ use tch::kind::Element;
 
 /// R, the samples of a block.
 const BLOCK: usize = 16;
-
-/// Room for ŝ and s̄ of a layer's gates.
-#[derive(Debug)]
-struct Scratch<T> {
-    u: Vec<T>,
-    v: Vec<T>,
-}
-
-impl<T: Real> Scratch<T> {
-    fn new() -> Self {
-        Self { u: Vec::new(), v: Vec::new() }
-    }
-
-    /// For `rows` samples of u, `[rows, outputs * inputs]`, and of v, `[rows, outputs]`.
-    fn split(&mut self, rows: usize, inputs: usize, outputs: usize) -> (&mut [T], &mut [T]) {
-        let (u, v) = (rows * outputs * inputs, rows * outputs);
-        if self.u.len() < u {
-            self.u.resize(u, T::ZERO);
-        }
-        if self.v.len() < v {
-            self.v.resize(v, T::ZERO);
-        }
-        (&mut self.u[..u], &mut self.v[..v])
-    }
-}
 
 /// Computes outer losses and their gradients, on some threads, in memory that is kept from batch to batch.
 #[derive(Debug)]

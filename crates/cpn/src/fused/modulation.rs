@@ -7,16 +7,38 @@ use super::lanes::Lanes;
 use super::linear::{Linear, LinearGradient};
 use super::real::Real;
 use pulp::{Simd, WithSimd};
+use std::ops::Range;
 
-/// y; turns s - b₂ into u and v on the way.
+/// σ(s) of s - b₂, row by row.
+#[derive(Debug)]
+pub struct Sigmoid<'a, T> {
+    pub s: &'a mut [T],
+    pub bias: &'a [T],
+}
+
+impl<T: Real> WithSimd for Sigmoid<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let count = Lanes::<S, T>::COUNT;
+        for row in self.s.chunks_exact_mut(self.bias.len()) {
+            for (s, bias) in row.chunks_mut(count).zip(self.bias.chunks(count)) {
+                (Lanes::load(simd, s) + Lanes::load(simd, bias)).sigmoid().store(s);
+            }
+        }
+    }
+}
+
+/// Some of y; turns s - b₂ into u on the way.
 #[derive(Debug)]
 pub struct Forward<'a, T> {
     pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub u_bias: &'a [T],
-    pub v_bias: &'a [T],
     pub x: &'a [T],
     pub u: &'a mut [T],
-    pub v: &'a mut [T],
+    pub v: &'a [T],
     pub y: &'a mut [T],
 }
 
@@ -25,13 +47,14 @@ impl<T: Real> WithSimd for Forward<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, u_bias, v_bias, x, u, v, y } = self;
-        let inputs = linear.inputs;
-        let samples = x.chunks_exact(inputs).zip(u.chunks_exact_mut(u_bias.len()));
-        let samples = samples.zip(v.chunks_exact_mut(linear.outputs)).zip(y.chunks_exact_mut(linear.outputs));
-        for (((x, u), v), y) in samples {
-            let rows = u.chunks_exact_mut(inputs).zip(u_bias.chunks_exact(inputs));
-            for (o, ((u, u_bias), a)) in rows.zip(linear.weight().chunks_exact(inputs)).enumerate() {
+        let Self { linear, outputs: part, u_bias, x, u, v, y } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let weight = &linear.weight()[part.start * inputs..];
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            for (j, o) in part.clone().enumerate() {
+                let at = r * outputs + o;
+                let u = &mut u[(r * part.len() + j) * inputs..][..inputs];
+                let [u_bias, a] = [u_bias, weight].map(|row| &row[j * inputs..][..inputs]);
                 let mut sum = Lanes::splat(simd, T::ZERO);
                 for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
                     let [s, bias, a, x] = [&u[i..], &u_bias[i..], &a[i..], &x[i..]].map(|s| Lanes::load(simd, s));
@@ -39,8 +62,7 @@ impl<T: Real> WithSimd for Forward<'_, T> {
                     open.store(&mut u[i..]);
                     sum = (open * a).mul_add(x, sum);
                 }
-                v[o] = (v[o] + v_bias[o]).sigmoid();
-                y[o] = sum.sum() + v[o] * linear.bias()[o];
+                y[at] = sum.sum() + v[at] * linear.bias()[o];
             }
         }
     }
@@ -50,6 +72,7 @@ impl<T: Real> WithSimd for Forward<'_, T> {
 #[derive(Debug)]
 pub struct Backward<'a, T> {
     pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub u: &'a [T],
     pub v: &'a [T],
@@ -64,22 +87,28 @@ impl<T: Real> WithSimd for Backward<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, x, u, v, y_bar, x_bar, s_u, s_v } = self;
+        let Self { linear, outputs: part, x, u, v, y_bar, x_bar, s_u, s_v } = self;
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
-        for r in 0..x.len() / inputs {
-            let (x, x_bar) = (&x[r * inputs..][..inputs], &mut x_bar[r * inputs..][..inputs]);
-            for (o, a) in linear.weight().chunks_exact(inputs).enumerate() {
-                let at = r * outputs + o;
-                let (u, s_u) = (&u[at * inputs..][..inputs], &mut s_u[at * inputs..][..inputs]);
-                let y = Lanes::splat(simd, y_bar[at]);
-                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [u, a, x] = [&u[i..], &a[i..], &x[i..]].map(|s| Lanes::load(simd, s));
-                    let direct = y * u * a;
-                    direct.add_to(&mut x_bar[i..]);
-                    (direct * (one - u) * x).store(&mut s_u[i..]);
+        let weight = &linear.weight()[part.start * inputs..];
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            let block = r * part.len() * inputs;
+            let y_bar = &y_bar[r * outputs..][part.clone()];
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let x_bar = &mut x_bar[r * inputs..][i..inputs];
+                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_bar));
+                for (j, y) in y_bar.iter().enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, a] = [&u[block..][from..to], &weight[from..to]].map(|s| Lanes::load(simd, s));
+                    let open = Lanes::splat(simd, *y) * u * a;
+                    sum = sum + open;
+                    (open * (one - u) * x).store(&mut s_u[block..][from..to]);
                 }
-                s_v[at] = y_bar[at] * linear.bias()[o] * v[at] * (T::ONE - v[at]);
+                sum.store(x_bar);
+            }
+            for (o, y_bar) in part.clone().zip(y_bar) {
+                let at = r * outputs + o;
+                s_v[at] = *y_bar * linear.bias()[o] * v[at] * (T::ONE - v[at]);
             }
         }
     }
@@ -89,6 +118,7 @@ impl<T: Real> WithSimd for Backward<'_, T> {
 #[derive(Debug)]
 pub struct Tangent<'a, T> {
     pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub x_dot: &'a [T],
     pub u: &'a [T],
@@ -103,14 +133,15 @@ impl<T: Real> WithSimd for Tangent<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot } = self;
+        let Self { linear, outputs: part, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot } = self;
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
         for r in 0..x.len() / inputs {
             let [x, x_dot] = [x, x_dot].map(|x| &x[r * inputs..][..inputs]);
-            for (o, a) in linear.weight().chunks_exact(inputs).enumerate() {
-                let at = r * outputs + o;
-                let [u, s_dot] = [u, s_dot_u].map(|u| &u[at * inputs..][..inputs]);
+            for (j, o) in part.clone().enumerate() {
+                let (at, place) = (r * outputs + o, (r * part.len() + j) * inputs);
+                let a = &linear.weight()[o * inputs..][..inputs];
+                let [u, s_dot] = [u, s_dot_u].map(|u| &u[place..][..inputs]);
                 let mut sum = Lanes::splat(simd, T::ZERO);
                 for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
                     let [u, s_dot, a] = [&u[i..], &s_dot[i..], &a[i..]].map(|s| Lanes::load(simd, s));
@@ -127,6 +158,7 @@ impl<T: Real> WithSimd for Tangent<'_, T> {
 #[derive(Debug)]
 pub struct FirstAdjoint<'a, T> {
     pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub u: &'a [T],
     pub v: &'a [T],
@@ -142,24 +174,30 @@ impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, x, u, v, y_hat, x_hat, s_u, s_v, gradient } = self;
+        let Self { linear, outputs: part, x, u, v, y_hat, x_hat, s_u, s_v, gradient } = self;
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
-        for r in 0..x.len() / inputs {
-            let (x, x_hat) = (&x[r * inputs..][..inputs], &mut x_hat[r * inputs..][..inputs]);
-            for (o, a) in linear.weight().chunks_exact(inputs).enumerate() {
-                let at = r * outputs + o;
-                let (u, s_u) = (&u[at * inputs..][..inputs], &mut s_u[at * inputs..][..inputs]);
-                let in_a = &mut gradient.weight[o * inputs..][..inputs];
-                let y = Lanes::splat(simd, y_hat[at]);
-                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [u, a, x] = [&u[i..], &a[i..], &x[i..]].map(|s| Lanes::load(simd, s));
-                    let open = y * u;
-                    (open * a).add_to(&mut x_hat[i..]);
-                    (open * x).add_to(&mut in_a[i..]);
-                    (open * (one - u) * a * x).store(&mut s_u[i..]);
+        let weights = part.start * inputs..part.end * inputs;
+        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            let block = r * weights.len();
+            let y_hat = &y_hat[r * outputs..][part.clone()];
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let x_hat = &mut x_hat[r * inputs..][i..inputs];
+                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_hat));
+                for (j, y) in y_hat.iter().enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, a] = [&u[block..][from..to], &weight[from..to]].map(|s| Lanes::load(simd, s));
+                    let open = Lanes::splat(simd, *y) * u;
+                    sum = open.mul_add(a, sum);
+                    (open * x).add_to(&mut in_weight[from..to]);
+                    (open * (one - u) * a * x).store(&mut s_u[block..][from..to]);
                 }
-                let open = y_hat[at] * v[at];
+                sum.store(x_hat);
+            }
+            for (o, y_hat) in part.clone().zip(y_hat) {
+                let at = r * outputs + o;
+                let open = *y_hat * v[at];
                 gradient.bias[o] += open;
                 s_v[at] = open * (T::ONE - v[at]) * linear.bias()[o];
             }
@@ -171,6 +209,7 @@ impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
 #[derive(Debug)]
 pub struct SecondAdjoint<'a, T> {
     pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     /// x and ẋ.
     pub x: [&'a [T]; 2],
     pub u: &'a [T],
@@ -191,37 +230,42 @@ impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, x, u, v, s_dot_u, s_dot_v, y, x_hat, s_u, s_v, gradient } = self;
+        let Self { linear, outputs: part, x, u, v, s_dot_u, s_dot_v, y, x_hat, s_u, s_v, gradient } = self;
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
+        let weights = part.start * inputs..part.end * inputs;
+        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
         for r in 0..x[0].len() / inputs {
-            let [x, x_dot] = x.map(|x| &x[r * inputs..][..inputs]);
-            let x_hat = &mut x_hat[r * inputs..][..inputs];
-            for (o, a) in linear.weight().chunks_exact(inputs).enumerate() {
-                let at = r * outputs + o;
-                let [u, s_dot] = [u, s_dot_u].map(|u| &u[at * inputs..][..inputs]);
-                let s_hat = &mut s_u.0[at * inputs..][..inputs];
-                let s_bar = &mut s_u.1[at * inputs..][..inputs];
-                let in_a = &mut gradient.weight[o * inputs..][..inputs];
-                let [y_hat, y_bar] = y.map(|y| Lanes::splat(simd, y[at]));
-                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [u, s_dot, a] = [&u[i..], &s_dot[i..], &a[i..]].map(|s| Lanes::load(simd, s));
-                    let [x, x_dot] = [&x[i..], &x_dot[i..]].map(|s| Lanes::load(simd, s));
+            let block = r * weights.len();
+            let [y_hat, y_bar] = y.map(|y| &y[r * outputs..][part.clone()]);
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let x_hat = &mut x_hat[r * inputs..][i..inputs];
+                let [x, x_dot] = x.map(|x| Lanes::load(simd, &x[r * inputs..][i..inputs]));
+                let mut sum = Lanes::load(simd, x_hat);
+                for (j, (y_hat, y_bar)) in y_hat.iter().zip(y_bar).enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, s_dot] = [u, s_dot_u].map(|s| Lanes::load(simd, &s[block..][from..to]));
+                    let (a, in_a) = (Lanes::load(simd, &weight[from..to]), &mut in_weight[from..to]);
+                    let [y_hat, y_bar] = [*y_hat, *y_bar].map(|y| Lanes::splat(simd, y));
                     let shut = one - u;
                     let slope = u * shut;
                     let moved = y_bar * s_dot;
                     let (p, q) = (y_hat.mul_add(x, y_bar * x_dot), moved * x);
-                    (a * y_hat.mul_add(u, moved * slope)).add_to(&mut x_hat[i..]);
-                    u.mul_add(p, slope * q).add_to(&mut in_a[i..]);
+                    sum = a.mul_add(y_hat.mul_add(u, moved * slope), sum);
+                    u.mul_add(p, slope * q).add_to(in_a);
                     let slope = a * slope;
-                    (slope * (shut - u).mul_add(q, p)).store(&mut s_hat[i..]);
-                    (slope * y_bar * x).store(&mut s_bar[i..]);
+                    (slope * (shut - u).mul_add(q, p)).store(&mut s_u.0[block..][from..to]);
+                    (slope * y_bar * x).store(&mut s_u.1[block..][from..to]);
                 }
-                let ([y_hat, y_bar], v, b) = (y.map(|y| y[at]), v[at], linear.bias()[o]);
-                let (slope, moved) = (v * (T::ONE - v), y_bar * s_dot_v[at]);
-                gradient.bias[o] += v * y_hat + slope * moved;
-                s_v.0[at] = b * slope * (y_hat + (T::ONE - v - v) * moved);
-                s_v.1[at] = b * slope * y_bar;
+                sum.store(x_hat);
+            }
+            for (o, (y_hat, y_bar)) in part.clone().zip(y_hat.iter().zip(y_bar)) {
+                let at = r * outputs + o;
+                let (v, b) = (v[at], linear.bias()[o]);
+                let (slope, moved) = (v * (T::ONE - v), *y_bar * s_dot_v[at]);
+                gradient.bias[o] += v * *y_hat + slope * moved;
+                s_v.0[at] = b * slope * (*y_hat + (T::ONE - v - v) * moved);
+                s_v.1[at] = b * slope * *y_bar;
             }
         }
     }

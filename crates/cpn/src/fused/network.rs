@@ -1,8 +1,8 @@
 //! g_θ: the four passes over one step of a rollout.
 
-use super::Scratch;
 use super::dense::{Dense, DenseGradient, Order, Tape};
 use super::gate::{mask, rectify};
+use super::gated::Scratch;
 use super::linear::{Weights, add};
 use super::real::Real;
 use crate::config::ModelConfig;
@@ -102,7 +102,11 @@ impl<T: Real> Network<T> {
     pub fn buffers(&self, rows: usize) -> Buffers<T> {
         let Sizes { latent, hidden, actions, seen } = self.sizes;
         let zeros = |columns: usize| vec![T::ZERO; rows * columns];
-        Buffers { gates: Scratch::new(), wide: zeros(seen.max(hidden + actions)), narrow: zeros(latent.max(hidden)) }
+        Buffers {
+            gates: Scratch::default(),
+            wide: zeros(seen.max(hidden + actions)),
+            narrow: zeros(latent.max(hidden)),
+        }
     }
 
     /// The trunk: leaves the features of x, `[R, Z]`, on the tape; x_g likewise.

@@ -226,9 +226,7 @@ impl Method for Planner {
         if let Some(agent) = &self.half {
             return in_bfloat16(agent, inputs);
         }
-        spread(&mut self.workers, inputs, 1, |worker, inputs| {
-            inputs.iter().map(|input| encoder.encode(*input, &mut worker.room)).collect()
-        })
+        spread(&mut self.workers, inputs, (1, BLOCK), |worker, inputs| encoder.encode(inputs, &mut worker.room))
     }
 
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
@@ -237,7 +235,7 @@ impl Method for Planner {
             Iterations::Fixed(count) => {
                 let solver = search.solver;
                 let block = if solver == Solver::Gradient { BLOCK } else { 1 };
-                spread(&mut self.workers, queries, block, |worker, queries| {
+                spread(&mut self.workers, queries, (block, block), |worker, queries| {
                     worker.search(dynamics, queries, solver, &mut Iterations::Fixed(count))
                 })
             }
@@ -260,14 +258,15 @@ fn in_bfloat16(agent: &Agent, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
     embeddings.chunks_exact(embeddings.len() / inputs.len()).map(<[f32]>::to_vec).collect()
 }
 
-/// Runs over blocks of the items, on as many threads as there are workers; the results in the order of the items.
+/// Runs over blocks of the items, on as many threads as there are workers and `least` items for each; the results in the order
+/// of the items.
 fn spread<I: Sync, O: Send>(
     workers: &mut [Worker<f32>],
     items: &[I],
-    block: usize,
+    (least, block): (usize, usize),
     run: impl Fn(&mut Worker<f32>, &[I]) -> Vec<O> + Sync,
 ) -> Vec<O> {
-    let share = items.len().div_ceil(workers.len()).next_multiple_of(block);
+    let share = items.len().div_ceil(workers.len()).next_multiple_of(least);
     if share >= items.len() {
         // Another thread would only have to be woken.
         return items.chunks(block).flat_map(|items| run(&mut workers[0], items)).collect();

@@ -1,0 +1,285 @@
+//! Products of matrices, by a kernel whose sums do not depend on how many rows there are: each number of a product is summed
+//! along the inner dimension in order, so that a row comes out the same, bit for bit, alone or among others.
+//!
+//! What the kernel keeps in registers is filled in loops of fixed length over slices of fixed length: closures and iterators
+//! in their place send it through memory.
+
+use super::lanes::Lanes;
+use super::matrix::{Matrix, REGISTERS, Shape};
+use super::real::Real;
+use pulp::{Arch, Simd, WithSimd};
+use std::ops::Range;
+
+/// Numbers of the largest tile: eight rows of a panel, or four panels of a row.
+const TILE: usize = 8 * REGISTERS * 16;
+/// Numbers of a single row that are looked through at once for zeros.
+const CHUNK: usize = 256;
+/// Numbers of b that are read faster than those of a row are looked through.
+const SMALL: usize = 1 << 14;
+
+/// c = a b, added to what is in c if `accumulate`: c is `[rows, columns]`.
+pub fn multiply<T: Real>(accumulate: bool, c: &mut [T], a: Left<'_, T>, b: Matrix<'_, T>) {
+    let mut product = Product { accumulate, rows: c.len() / b.columns, c, a, b };
+    product.run();
+}
+
+#[derive(Debug)]
+struct Product<'a, T> {
+    accumulate: bool,
+    rows: usize,
+    c: &'a mut [T],
+    a: Left<'a, T>,
+    b: Matrix<'a, T>,
+}
+
+/// a of a product.
+#[derive(Debug, Clone, Copy)]
+pub enum Left<'a, T> {
+    /// `[rows, inner]`.
+    Rows(&'a [T]),
+    /// `[inner, rows]`.
+    Turned(&'a [T]),
+    /// Patches of an image: a row's numbers lie at the same `places`, in ascending order, from a start of its own on.
+    Patches { image: &'a [T], starts: &'a [usize], places: &'a [usize] },
+}
+
+impl<T> Left<'_, T> {
+    fn has_shape(&self, rows: usize, inner: usize) -> bool {
+        match self {
+            Left::Rows(values) | Left::Turned(values) => values.len() == rows * inner,
+            Left::Patches { starts, places, .. } => starts.len() == rows && places.len() == inner,
+        }
+    }
+}
+
+/// Sums in registers: of R rows, at P panels.
+type Sums<S, T, const R: usize, const P: usize> = [[[Lanes<S, T>; REGISTERS]; P]; R];
+
+impl<T: Real> Product<'_, T> {
+    fn run(&mut self) {
+        let (rows, Matrix { inner, columns, .. }) = (self.rows, self.b);
+        assert!(self.c.len() == rows * columns && self.a.has_shape(rows, inner), "shapes of a product");
+        // As many rows at once as there are registers for their sums, a part of b and a number of a.
+        let mut row = 0;
+        if Shape::of::<T>().registers >= 32 {
+            row = self.tiles::<8>(row);
+        }
+        row = self.tiles::<6>(row);
+        row = self.tiles::<4>(row);
+        row = self.tiles::<2>(row);
+        for row in row..rows {
+            Arch::new().dispatch(Row { product: self, row });
+        }
+    }
+
+    /// As many rows from `row` on as R divides; answers the row after them.
+    fn tiles<const R: usize>(&mut self, row: usize) -> usize {
+        let end = row + (self.rows - row) / R * R;
+        if end > row {
+            Arch::new().dispatch(Tiles::<T, R> { product: self, rows: row..end });
+        }
+        end
+    }
+
+    /// Of R rows of c, at P panels, the part that some places along the inner dimension give: as the first, or added to what
+    /// is there. The places are those of whole rows of b, and others. `room` is for what juts out over c's right edge.
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize, const P: usize>(
+        &mut self,
+        simd: S,
+        (row, panel): (usize, usize),
+        first: bool,
+        places: [impl Iterator<Item = usize>; 2],
+        room: &mut [T; TILE],
+    ) {
+        let (columns, count) = (self.b.columns, Lanes::<S, T>::COUNT);
+        let (at, width) = (panel * REGISTERS * count, P * REGISTERS * count);
+        let is_out = columns - at < width;
+        let lines = (row..row + R).map(|row| row * columns + at..(row + 1) * columns);
+        if is_out {
+            for (line, room) in lines.clone().zip(room.chunks_exact_mut(width)) {
+                room[..line.len()].copy_from_slice(&self.c[line]);
+            }
+        }
+        let (c, stride) = if is_out { (&mut room[..], width) } else { (&mut self.c[row * columns + at..], columns) };
+        let mut sums = [[[Lanes::splat(simd, T::ZERO); REGISTERS]; P]; R];
+        if !first {
+            for (r, sums) in sums.iter_mut().enumerate() {
+                let line = &c[r * stride..][..width];
+                for (p, sums) in sums.iter_mut().enumerate() {
+                    for (i, sum) in sums.iter_mut().enumerate() {
+                        *sum = Lanes::load(simd, &line[(p * REGISTERS + i) * count..][..count]);
+                    }
+                }
+            }
+        }
+        sums = along(simd, sums, (self.a, row, self.rows), (self.b, panel), places);
+        for (r, sums) in sums.iter().enumerate() {
+            let line = &mut c[r * stride..][..width];
+            for (part, sum) in line.chunks_exact_mut(count).zip(sums.as_flattened()) {
+                sum.store(part);
+            }
+        }
+        if is_out {
+            for (line, room) in lines.zip(room.chunks_exact(width)) {
+                let count = line.len();
+                self.c[line].copy_from_slice(&room[..count]);
+            }
+        }
+    }
+}
+
+/// R rows at a time.
+#[derive(Debug)]
+struct Tiles<'a, 'b, T, const R: usize> {
+    product: &'a mut Product<'b, T>,
+    rows: Range<usize>,
+}
+
+impl<T: Real, const R: usize> WithSimd for Tiles<'_, '_, T, R> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { product, rows } = self;
+        let Matrix { inner, whole, columns, .. } = product.b;
+        let mut room = [T::ZERO; TILE];
+        for panel in 0..columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
+            for row in rows.clone().step_by(R) {
+                product.tile::<S, R, 1>(simd, (row, panel), !product.accumulate, [0..whole, whole..inner], &mut room);
+            }
+        }
+    }
+}
+
+/// A row by itself, which waits for b to be read; half of it need not be where a is what a rectified linear unit left.
+#[derive(Debug)]
+struct Row<'a, 'b, T> {
+    product: &'a mut Product<'b, T>,
+    row: usize,
+}
+
+impl<T: Real> WithSimd for Row<'_, '_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let Product { a, b: Matrix { inner, whole, columns, .. }, accumulate, .. } = *self.product;
+        let mut room = [T::ZERO; TILE];
+        let (Left::Rows(a), SMALL..) = (a, inner * columns) else {
+            return self.panels(simd, !accumulate, [0..whole, whole..inner], &mut room);
+        };
+        let mut places = [0; CHUNK];
+        for start in (0..inner).step_by(CHUNK) {
+            let end = inner.min(start + CHUNK);
+            let mut count = 0;
+            for (k, a) in (start..end).zip(&a[self.row * inner..][start..end]) {
+                places[count] = k;
+                count += usize::from(*a != T::ZERO);
+            }
+            let (whole, rest) = places[..count].split_at(places[..count].partition_point(|k| *k < whole));
+            let places = [whole.iter().copied(), rest.iter().copied()];
+            self.panels(simd, start == 0 && !accumulate, places, &mut room);
+        }
+    }
+}
+
+impl<T: Real> Row<'_, '_, T> {
+    /// Several panels at once, so that no sum waits for the one before.
+    #[inline(always)]
+    fn panels<S: Simd>(
+        &mut self,
+        simd: S,
+        first: bool,
+        places: [impl Iterator<Item = usize> + Clone; 2],
+        room: &mut [T; TILE],
+    ) {
+        let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
+        let mut panel = 0;
+        while panel + 4 <= panels {
+            self.product.tile::<S, 1, 4>(simd, (self.row, panel), first, places.clone(), room);
+            panel += 4;
+        }
+        while panel + 2 <= panels {
+            self.product.tile::<S, 1, 2>(simd, (self.row, panel), first, places.clone(), room);
+            panel += 2;
+        }
+        if panel < panels {
+            self.product.tile::<S, 1, 1>(simd, (self.row, panel), first, places, room);
+        }
+    }
+}
+
+/// Adds to sums what some places along the inner dimension give.
+#[inline(always)]
+fn along<S: Simd, T: Real, const R: usize, const P: usize>(
+    simd: S,
+    mut sums: Sums<S, T, R, P>,
+    (a, row, count): (Left<'_, T>, usize, usize),
+    (b, panel): (Matrix<'_, T>, usize),
+    [whole, rest]: [impl Iterator<Item = usize>; 2],
+) -> Sums<S, T, R, P> {
+    let mut panels = [b.values; P];
+    for (p, values) in panels.iter_mut().enumerate() {
+        *values = &b.values[(panel + p) * b.apart..];
+    }
+    let (inner, b) = (b.inner, (panels, b.stride));
+    match a {
+        Left::Rows(values) => {
+            let mut rows = [values; R];
+            for (r, values) in rows.iter_mut().enumerate() {
+                *values = &values[(row + r) * inner..][..inner];
+            }
+            let a = |r: usize, k: usize| rows[r][k];
+            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
+            add::<S, T, R, P, false>(simd, sums, rest, a, b)
+        }
+        Left::Turned(values) => {
+            let a = |r: usize, k: usize| values[row + k * count..][..R][r];
+            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
+            add::<S, T, R, P, false>(simd, sums, rest, a, b)
+        }
+        Left::Patches { image, starts, places } => {
+            let (mut rows, size) = ([image; R], places[inner - 1] + 1);
+            for (values, start) in rows.iter_mut().zip(&starts[row..][..R]) {
+                *values = &values[*start..][..size];
+            }
+            let a = |r: usize, k: usize| rows[r][places[k]];
+            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
+            add::<S, T, R, P, false>(simd, sums, rest, a, b)
+        }
+    }
+}
+
+/// Adds to the sums, for each place k along the inner dimension, R numbers of a, which `a` answers, times P panels of b, whose
+/// rows are `stride` apart and, if they are not WHOLE, may end within a register.
+#[inline(always)]
+fn add<S: Simd, T: Real, const R: usize, const P: usize, const WHOLE: bool>(
+    simd: S,
+    mut sums: Sums<S, T, R, P>,
+    places: impl Iterator<Item = usize>,
+    a: impl Fn(usize, usize) -> T,
+    (b, stride): ([&[T]; P], usize),
+) -> Sums<S, T, R, P> {
+    let count = Lanes::<S, T>::COUNT;
+    for k in places {
+        for (p, b) in b.iter().enumerate() {
+            let mut line = &b[k * stride..];
+            if WHOLE {
+                line = &line[..REGISTERS * count];
+            }
+            let part = |i| if WHOLE { &line[i * count..][..count] } else { line.get(i * count..).unwrap_or_default() };
+            let mut b = [Lanes::splat(simd, T::ZERO); REGISTERS];
+            for (i, b) in b.iter_mut().enumerate() {
+                *b = Lanes::load(simd, part(i));
+            }
+            for (r, sums) in sums.iter_mut().enumerate() {
+                let a = Lanes::splat(simd, a(r, k));
+                for (sum, b) in sums[p].iter_mut().zip(b) {
+                    *sum = a.mul_add(b, *sum);
+                }
+            }
+        }
+    }
+    sums
+}
