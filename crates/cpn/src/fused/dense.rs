@@ -2,6 +2,7 @@
 
 use super::gate::GateGradient;
 use super::gated::{Gated, GatesGradient, GatesTape, Scratch};
+use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
 
@@ -25,9 +26,9 @@ pub struct Tape<T> {
     inputs: usize,
     outputs: usize,
     /// x and ẋ, `[2 R, inputs]`.
-    x: Vec<T>,
+    x: Aligned<T>,
     /// ŷ and ȳ, `[2 R, outputs]`.
-    y: Vec<T>,
+    y: Aligned<T>,
     gates: Option<GatesTape<T>>,
 }
 
@@ -55,7 +56,7 @@ impl<T: Real> Tape<T> {
 
 impl<T> DenseGradient<T> {
     /// Every tensor, by its name in a checkpoint.
-    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Vec<T>)> {
+    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
         let mut tensors = self.linear.tensors(name);
         if let Some(gates) = &mut self.gates {
             for (gate, GateGradient { hidden, output }) in [("u", &mut gates.u), ("v", &mut gates.v)] {
@@ -106,9 +107,8 @@ impl<T: Real> Dense<T> {
     /// A tape for blocks of up to R = `rows` samples.
     pub fn tape(&self, rows: usize) -> Tape<T> {
         let Linear { inputs, outputs, .. } = *self.linear();
-        let zeros = |columns| vec![T::ZERO; 2 * rows * columns];
         let gates = self.gated().map(|gated| gated.tape(rows));
-        Tape { inputs, outputs, x: zeros(inputs), y: zeros(outputs), gates }
+        Tape { inputs, outputs, x: zeros(2 * rows * inputs), y: zeros(2 * rows * outputs), gates }
     }
 
     /// y `[R, outputs]` of the tape's x.

@@ -1,6 +1,7 @@
 //! The encoder f_φ for planning: convolutions as products with patches of the image.
 
 use super::gate::rectify;
+use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, Weights};
 use super::matrix::Panels;
 use super::product::{Left, multiply};
@@ -49,12 +50,19 @@ struct Norm<T> {
 }
 
 /// Room for the passes, kept from image to image.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Room<T> {
-    x: Vec<T>,
-    y: Vec<T>,
+    x: Aligned<T>,
+    y: Aligned<T>,
     /// Of all inputs, `[R, F]`.
-    features: Vec<T>,
+    features: Aligned<T>,
+}
+
+impl<T: Real> Room<T> {
+    /// Empty.
+    pub fn new() -> Self {
+        Self { x: zeros(0), y: zeros(0), features: zeros(0) }
+    }
 }
 
 impl<T: Real> Encoder<T> {
@@ -127,8 +135,9 @@ impl<T: Real> Body<T> {
                 }
             }
             (Self::Position { centre_metres, scale_metres, layers }, Observed::Position(metres)) => {
-                let values = metres.iter().zip(centre_metres);
-                room.x.extend(values.map(|(at, centre)| T::from_f64(f64::from(*at) - centre) / *scale_metres));
+                for (at, centre) in metres.iter().zip(centre_metres) {
+                    room.x.push(T::from_f64(f64::from(*at) - centre) / *scale_metres);
+                }
                 for layer in layers {
                     room.y.clear();
                     room.y.resize(layer.outputs, T::ZERO);

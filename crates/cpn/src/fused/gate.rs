@@ -1,6 +1,7 @@
 //! u_β or v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to the [layer that is
 //! attenuated](super::gated), which runs over the same numbers anyway, and asks for them part by part.
 
+use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
 use std::ops::Range;
@@ -24,13 +25,13 @@ pub struct GateGradient<T> {
 pub struct GateTape<T> {
     width: usize,
     /// h and ḣ, `[2 R, width]`.
-    h: Vec<T>,
+    h: Aligned<T>,
     /// ĥ and h̄, `[2 R, width]`.
-    h_adjoint: Vec<T>,
+    h_adjoint: Aligned<T>,
     /// First s - b₂, then σ(s): for each part `[R, its outputs]`.
-    out: Vec<T>,
+    out: Aligned<T>,
     /// ṡ, likewise.
-    s_dot: Vec<T>,
+    s_dot: Aligned<T>,
 }
 
 impl<T: Real> GateTape<T> {
@@ -55,8 +56,13 @@ impl<T: Real> Gate<T> {
 
     pub fn tape(&self, rows: usize) -> GateTape<T> {
         let (width, outputs) = (self.hidden.outputs, self.output.outputs);
-        let zeros = |size| vec![T::ZERO; rows * size];
-        GateTape { width, h: zeros(2 * width), h_adjoint: zeros(2 * width), out: zeros(outputs), s_dot: zeros(outputs) }
+        GateTape {
+            width,
+            h: zeros(2 * rows * width),
+            h_adjoint: zeros(2 * rows * width),
+            out: zeros(rows * outputs),
+            s_dot: zeros(rows * outputs),
+        }
     }
 
     /// All that it attenuates.

@@ -11,6 +11,7 @@
 //! and for v the same with b in place of a and 1 in place of x.
 
 use super::gate::{Gate, GateGradient, GateTape};
+use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Sigmoid, Tangent};
 use super::real::Real;
@@ -36,10 +37,16 @@ pub struct GatesGradient<T> {
 }
 
 /// Room for ŝ and s̄ of the gates: of a part of u, and of all of v.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Scratch<T> {
-    u: Vec<T>,
-    v: Vec<T>,
+    u: Aligned<T>,
+    v: Aligned<T>,
+}
+
+impl<T: Real> Scratch<T> {
+    pub fn new() -> Self {
+        Self { u: zeros(0), v: zeros(0) }
+    }
 }
 
 /// What the passes leave for each other.
@@ -157,12 +164,12 @@ impl<T: Real> Gated<T> {
             } else {
                 Arch::new().dispatch(SecondAdjoint {
                     linear,
-                    x: x.split_at(rows * inputs).into(),
+                    x: x.split_at(rows * inputs),
                     u,
                     v,
                     s_dot_u: tape.u.s_dot(rows, &weights),
                     s_dot_v: tape.v.s_dot(rows, &self.v.all()),
-                    y: y.split_at(rows * linear.outputs).into(),
+                    y: y.split_at(rows * linear.outputs),
                     x_hat,
                     s_u: s_u.split_at_mut(rows * weights.len()),
                     s_v: s_v.split_at_mut(rows * linear.outputs),
@@ -179,7 +186,7 @@ impl<T: Real> Gated<T> {
 }
 
 /// So much of a memory, which grows if it must.
-fn room<T: Real>(memory: &mut Vec<T>, size: usize) -> &mut [T] {
+fn room<T: Real>(memory: &mut Aligned<T>, size: usize) -> &mut [T] {
     if memory.len() < size {
         memory.resize(size, T::ZERO);
     }

@@ -1,8 +1,17 @@
 //! Numbers side by side in a register of the processor, as wide as it has them.
 
 use super::real::Real;
+use aligned_vec::{AVec, avec};
 use pulp::Simd;
 use std::ops::{Add, Mul, Sub};
+
+/// Numbers that begin at the start of a cache line, so that registers are not filled from two.
+pub type Aligned<T> = AVec<T>;
+
+/// So many zeros.
+pub fn zeros<T: Real>(count: usize) -> Aligned<T> {
+    avec![T::ZERO; count]
+}
 
 /// As many numbers as fill a register.
 #[derive(Debug)]
@@ -34,6 +43,17 @@ impl<S: Simd, T: Real> Lanes<S, T> {
     #[inline(always)]
     pub fn load(simd: S, slice: &[T]) -> Self {
         Self { simd, values: T::load(simd, slice) }
+    }
+
+    /// Of several slices the first numbers each.
+    #[inline(always)]
+    pub fn load_each<const N: usize>(simd: S, slices: [&[T]; N]) -> [Self; N] {
+        // A loop, for the closure of a `map` is not always made part of the kernel.
+        let mut lanes = [Self::splat(simd, T::ZERO); N];
+        for (lanes, slice) in lanes.iter_mut().zip(slices) {
+            *lanes = Self::load(simd, slice);
+        }
+        lanes
     }
 
     /// Writes over the first numbers of a slice, as many as it has.

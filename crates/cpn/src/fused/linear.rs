@@ -1,6 +1,6 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
-use super::lanes::Lanes;
+use super::lanes::{Aligned, Lanes, zeros};
 use super::matrix::{Matrix, Panels};
 use super::product::{Left, multiply};
 use super::real::Real;
@@ -19,7 +19,7 @@ pub struct Linear<T> {
     pub inputs: usize,
     pub outputs: usize,
     /// a, `[outputs, inputs]`.
-    weight: Vec<T>,
+    weight: Aligned<T>,
     /// aᵀ, `[inputs, outputs]`: each product reads the one whose rows it runs along.
     transposed: Panels<T>,
     /// b, `[outputs]`.
@@ -30,16 +30,17 @@ pub struct Linear<T> {
 #[derive(Debug, Clone)]
 pub struct LinearGradient<T> {
     /// `[outputs, inputs]`.
-    pub weight: Vec<T>,
+    pub weight: Aligned<T>,
     /// `[outputs]`.
-    pub bias: Vec<T>,
+    pub bias: Aligned<T>,
 }
 
 impl<T: Real> Linear<T> {
     /// A layer of a `[outputs, inputs]` and b `[outputs]`.
     pub fn new(weight: Vec<T>, bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
-        Self { inputs, outputs, transposed: Panels::transposed(&weight, inputs), weight, bias }
+        let transposed = Panels::transposed(&weight, inputs);
+        Self { inputs, outputs, weight: Aligned::from_iter(0, weight), transposed, bias }
     }
 
     /// The layer of this name in a checkpoint.
@@ -104,13 +105,13 @@ impl<T: Real> Linear<T> {
 
     /// A gradient of zeros.
     pub fn gradient(&self) -> LinearGradient<T> {
-        LinearGradient { weight: vec![T::ZERO; self.weight.len()], bias: vec![T::ZERO; self.bias.len()] }
+        LinearGradient { weight: zeros(self.weight.len()), bias: zeros(self.bias.len()) }
     }
 }
 
 impl<T> LinearGradient<T> {
     /// Both tensors, by their names in a checkpoint.
-    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Vec<T>)> {
+    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
         vec![(format!("{name}.weight"), &mut self.weight), (format!("{name}.bias"), &mut self.bias)]
     }
 }

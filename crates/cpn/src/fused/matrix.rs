@@ -1,6 +1,6 @@
 //! Matrices as [products](super::product) read them.
 
-use super::lanes::Lanes;
+use super::lanes::{Aligned, Lanes, zeros};
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
 use std::marker::PhantomData;
@@ -37,7 +37,7 @@ impl<'a, T: Real> Matrix<'a, T> {
 /// zeros.
 #[derive(Debug)]
 pub struct Panels<T> {
-    values: Vec<T>,
+    values: Aligned<T>,
     inner: usize,
     columns: usize,
 }
@@ -46,7 +46,7 @@ impl<T: Real> Panels<T> {
     /// Lays out the transpose of `[columns, inner]`.
     pub fn transposed(values: &[T], inner: usize) -> Self {
         let (columns, width) = (values.len() / inner, Shape::of::<T>().width);
-        let mut panels = vec![T::ZERO; inner * columns.next_multiple_of(width)];
+        let mut panels = zeros(inner * columns.next_multiple_of(width));
         for (panel, rows) in panels.chunks_exact_mut(inner * width).zip(values.chunks(inner * width)) {
             for (j, row) in rows.chunks_exact(inner).enumerate() {
                 for (k, value) in row.iter().enumerate() {

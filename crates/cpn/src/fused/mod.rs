@@ -45,8 +45,8 @@ use std::collections::HashMap;
 use tch::Tensor;
 use tch::kind::Element;
 
-/// R, the samples of a block.
-const BLOCK: usize = 16;
+/// R, the samples of a block in training: more, and weights are read less often; fewer, and what the passes leave stays nearer.
+const BLOCK: usize = 32;
 
 /// Computes outer losses and their gradients, on some threads, in memory that is kept from batch to batch.
 #[derive(Debug)]

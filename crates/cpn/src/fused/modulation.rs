@@ -54,10 +54,11 @@ impl<T: Real> WithSimd for Forward<'_, T> {
             for (j, o) in part.clone().enumerate() {
                 let at = r * outputs + o;
                 let u = &mut u[(r * part.len() + j) * inputs..][..inputs];
-                let [u_bias, a] = [u_bias, weight].map(|row| &row[j * inputs..][..inputs]);
+                let row = j * inputs..(j + 1) * inputs;
+                let (u_bias, a) = (&u_bias[row.clone()], &weight[row]);
                 let mut sum = Lanes::splat(simd, T::ZERO);
                 for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [s, bias, a, x] = [&u[i..], &u_bias[i..], &a[i..], &x[i..]].map(|s| Lanes::load(simd, s));
+                    let [s, bias, a, x] = Lanes::load_each(simd, [&u[i..], &u_bias[i..], &a[i..], &x[i..]]);
                     let open = (s + bias).sigmoid();
                     open.store(&mut u[i..]);
                     sum = (open * a).mul_add(x, sum);
@@ -99,7 +100,7 @@ impl<T: Real> WithSimd for Backward<'_, T> {
                 let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_bar));
                 for (j, y) in y_bar.iter().enumerate() {
                     let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, a] = [&u[block..][from..to], &weight[from..to]].map(|s| Lanes::load(simd, s));
+                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
                     let open = Lanes::splat(simd, *y) * u * a;
                     sum = sum + open;
                     (open * (one - u) * x).store(&mut s_u[block..][from..to]);
@@ -137,15 +138,16 @@ impl<T: Real> WithSimd for Tangent<'_, T> {
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
         for r in 0..x.len() / inputs {
-            let [x, x_dot] = [x, x_dot].map(|x| &x[r * inputs..][..inputs]);
+            let row = r * inputs..(r + 1) * inputs;
+            let (x, x_dot) = (&x[row.clone()], &x_dot[row]);
             for (j, o) in part.clone().enumerate() {
                 let (at, place) = (r * outputs + o, (r * part.len() + j) * inputs);
                 let a = &linear.weight()[o * inputs..][..inputs];
-                let [u, s_dot] = [u, s_dot_u].map(|u| &u[place..][..inputs]);
+                let (u, s_dot) = (&u[place..][..inputs], &s_dot_u[place..][..inputs]);
                 let mut sum = Lanes::splat(simd, T::ZERO);
                 for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [u, s_dot, a] = [&u[i..], &s_dot[i..], &a[i..]].map(|s| Lanes::load(simd, s));
-                    let [x, x_dot] = [&x[i..], &x_dot[i..]].map(|s| Lanes::load(simd, s));
+                    let [u, s_dot, a] = Lanes::load_each(simd, [&u[i..], &s_dot[i..], &a[i..]]);
+                    let [x, x_dot] = Lanes::load_each(simd, [&x[i..], &x_dot[i..]]);
                     sum = (a * u).mul_add(((one - u) * s_dot).mul_add(x, x_dot), sum);
                 }
                 y_dot[at] = sum.sum() + v[at] * (T::ONE - v[at]) * s_dot_v[at] * linear.bias()[o];
@@ -187,7 +189,7 @@ impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
                 let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_hat));
                 for (j, y) in y_hat.iter().enumerate() {
                     let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, a] = [&u[block..][from..to], &weight[from..to]].map(|s| Lanes::load(simd, s));
+                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
                     let open = Lanes::splat(simd, *y) * u;
                     sum = open.mul_add(a, sum);
                     (open * x).add_to(&mut in_weight[from..to]);
@@ -211,13 +213,13 @@ pub struct SecondAdjoint<'a, T> {
     pub linear: &'a Linear<T>,
     pub outputs: Range<usize>,
     /// x and ẋ.
-    pub x: [&'a [T]; 2],
+    pub x: (&'a [T], &'a [T]),
     pub u: &'a [T],
     pub v: &'a [T],
     pub s_dot_u: &'a [T],
     pub s_dot_v: &'a [T],
     /// ŷ and ȳ.
-    pub y: [&'a [T]; 2],
+    pub y: (&'a [T], &'a [T]),
     pub x_hat: &'a mut [T],
     /// ŝ and s̄.
     pub s_u: (&'a mut [T], &'a mut [T]),
@@ -230,23 +232,23 @@ impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, x, u, v, s_dot_u, s_dot_v, y, x_hat, s_u, s_v, gradient } = self;
+        let Self { linear, outputs: part, x: xs, u, v, s_dot_u, s_dot_v, y: ys, x_hat, s_u, s_v, gradient } = self;
         let Linear { inputs, outputs, .. } = *linear;
         let one = Lanes::splat(simd, T::ONE);
         let weights = part.start * inputs..part.end * inputs;
         let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
-        for r in 0..x[0].len() / inputs {
+        for r in 0..xs.0.len() / inputs {
+            let row = r * inputs..(r + 1) * inputs;
+            let (xs, x_hat) = ((&xs.0[row.clone()], &xs.1[row.clone()]), &mut x_hat[row]);
             let block = r * weights.len();
-            let [y_hat, y_bar] = y.map(|y| &y[r * outputs..][part.clone()]);
+            let (y_hat, y_bar) = (&ys.0[r * outputs..][part.clone()], &ys.1[r * outputs..][part.clone()]);
             for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                let x_hat = &mut x_hat[r * inputs..][i..inputs];
-                let [x, x_dot] = x.map(|x| Lanes::load(simd, &x[r * inputs..][i..inputs]));
-                let mut sum = Lanes::load(simd, x_hat);
+                let [x, x_dot, mut sum] = Lanes::load_each(simd, [&xs.0[i..], &xs.1[i..], &x_hat[i..]]);
                 for (j, (y_hat, y_bar)) in y_hat.iter().zip(y_bar).enumerate() {
                     let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, s_dot] = [u, s_dot_u].map(|s| Lanes::load(simd, &s[block..][from..to]));
+                    let [u, s_dot] = Lanes::load_each(simd, [&u[block..][from..to], &s_dot_u[block..][from..to]]);
                     let (a, in_a) = (Lanes::load(simd, &weight[from..to]), &mut in_weight[from..to]);
-                    let [y_hat, y_bar] = [*y_hat, *y_bar].map(|y| Lanes::splat(simd, y));
+                    let (y_hat, y_bar) = (Lanes::splat(simd, *y_hat), Lanes::splat(simd, *y_bar));
                     let shut = one - u;
                     let slope = u * shut;
                     let moved = y_bar * s_dot;
@@ -257,7 +259,7 @@ impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
                     (slope * (shut - u).mul_add(q, p)).store(&mut s_u.0[block..][from..to]);
                     (slope * y_bar * x).store(&mut s_u.1[block..][from..to]);
                 }
-                sum.store(x_hat);
+                sum.store(&mut x_hat[i..]);
             }
             for (o, (y_hat, y_bar)) in part.clone().zip(y_hat.iter().zip(y_bar)) {
                 let at = r * outputs + o;

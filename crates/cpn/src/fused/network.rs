@@ -3,6 +3,7 @@
 use super::dense::{Dense, DenseGradient, Order, Tape};
 use super::gate::{mask, rectify};
 use super::gated::Scratch;
+use super::lanes::{Aligned, zeros};
 use super::linear::{Weights, add};
 use super::real::Real;
 use crate::config::ModelConfig;
@@ -44,9 +45,9 @@ pub struct Step<T> {
     policy: [Tape<T>; 2],
     dynamics: Option<[Tape<T>; 2]>,
     /// The trunk's features `[R, hidden]`.
-    features: Vec<T>,
+    features: Aligned<T>,
     /// What the policy proposed, `[R, A]`.
-    proposed: Vec<T>,
+    proposed: Aligned<T>,
 }
 
 /// Room that no pass needs beyond its end.
@@ -54,8 +55,8 @@ pub struct Step<T> {
 pub struct Buffers<T> {
     gates: Scratch<T>,
     /// Features with the action, or what the trunk sees.
-    wide: Vec<T>,
-    narrow: Vec<T>,
+    wide: Aligned<T>,
+    narrow: Aligned<T>,
 }
 
 impl<T: Real> Network<T> {
@@ -93,19 +94,18 @@ impl<T: Real> Network<T> {
             trunk: self.trunk.tape(rows),
             policy: tapes(&self.policy),
             dynamics: self.dynamics.as_ref().map(tapes),
-            features: vec![T::ZERO; rows * self.sizes.hidden],
-            proposed: vec![T::ZERO; rows * self.sizes.actions],
+            features: zeros(rows * self.sizes.hidden),
+            proposed: zeros(rows * self.sizes.actions),
         }
     }
 
     /// Room for blocks of up to `rows` samples.
     pub fn buffers(&self, rows: usize) -> Buffers<T> {
         let Sizes { latent, hidden, actions, seen } = self.sizes;
-        let zeros = |columns: usize| vec![T::ZERO; rows * columns];
         Buffers {
-            gates: Scratch::default(),
-            wide: zeros(seen.max(hidden + actions)),
-            narrow: zeros(latent.max(hidden)),
+            gates: Scratch::new(),
+            wide: zeros(rows * seen.max(hidden + actions)),
+            narrow: zeros(rows * latent.max(hidden)),
         }
     }
 
@@ -279,7 +279,7 @@ impl<T: Real> Network<T> {
 
 impl<T> NetworkGradient<T> {
     /// Every tensor, by its name in a checkpoint, without `network.` before it.
-    pub fn tensors(&mut self) -> Vec<(String, &mut Vec<T>)> {
+    pub fn tensors(&mut self) -> Vec<(String, &mut Aligned<T>)> {
         let mut tensors = self.trunk.tensors("trunk");
         for (i, layer) in self.policy.iter_mut().enumerate() {
             tensors.extend(layer.tensors(&format!("policy_{i}")));

@@ -93,8 +93,7 @@ impl<T: Real> Sums<T> {
     /// The gradient by the names of the weights, that in α if it takes part.
     pub fn into_weights(mut self, with_step_size: bool) -> Vec<(String, Vec<T>)> {
         let tensors = self.network.tensors().into_iter();
-        let mut weights: Vec<_> =
-            tensors.map(|(name, tensor)| (format!("network.{name}"), std::mem::take(tensor))).collect();
+        let mut weights: Vec<_> = tensors.map(|(name, tensor)| (format!("network.{name}"), tensor.to_vec())).collect();
         if with_step_size {
             weights.push(("step_size".to_owned(), vec![self.step_size]));
         }

@@ -6,13 +6,16 @@ use super::linear::Weights;
 use super::network::{Buffers, Network};
 use super::real::Real;
 use super::sampling;
-use super::{BLOCK, Variables, floats};
+use super::{Variables, floats};
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
 use crate::images;
 use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
 use rayon::prelude::*;
+
+/// R, the plans of a block, for which another thread is worth waking.
+pub(super) const BLOCK: usize = 16;
 
 /// A learned method as it is served: its weights laid out for planning, in float32. What it plans is what autograd plans from
 /// the same weights ([`crate::inner_loop`]), within rounding; each plan comes out the same, bit for bit, alone or among others.
@@ -84,7 +87,7 @@ impl<T: Real> Worker<T> {
         let sizes = dynamics.network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];
         Self {
-            room: Room::default(),
+            room: Room::new(),
             rollout: Rollout::new(&dynamics.network, BLOCK, dynamics.horizon),
             buffers: dynamics.network.buffers(BLOCK),
             x: zeros(sizes.latent),

@@ -1,8 +1,7 @@
 //! Searches that try plans and keep what came near the goal.
 
-use super::BLOCK;
 use super::inner::{Actions, Purpose};
-use super::planner::{Dynamics, Worker};
+use super::planner::{BLOCK, Dynamics, Worker};
 use crate::method::{Iterations, Plan, Query, Solver};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
