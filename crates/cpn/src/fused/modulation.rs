@@ -1,7 +1,7 @@
 //! What the passes over a neuromodulated layer do for each weight. The formulas stand in [`gated`](super::gated).
 //!
-//! Each kernel runs over R samples; `a` is `[outputs, inputs]`, what belongs to u is `[R, outputs, inputs]`, the rest
-//! `[R, inputs]` or `[R, outputs]`.
+//! Each kernel runs over R samples and some of the outputs; `a` is `[outputs, inputs]`, what belongs to u is `[R, some outputs,
+//! inputs]`, the rest `[R, inputs]` or `[R, outputs]`.
 
 use super::lanes::Lanes;
 use super::linear::{Linear, LinearGradient};
