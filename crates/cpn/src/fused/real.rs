@@ -252,5 +252,8 @@ mod tests {
         Arch::new().dispatch(Sigmoids(&mut extremes));
         assert_eq!(extremes[..3], [1.0; 3]);
         assert!(extremes[3..].iter().all(|value| (0.0..1e-37).contains(value)), "{extremes:?}");
+        let mut unknown = [f32::NAN; 3];
+        Arch::new().dispatch(Sigmoids(&mut unknown));
+        assert!(unknown.iter().all(|value| value.is_nan()), "{unknown:?}");
     }
 }
