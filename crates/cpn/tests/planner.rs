@@ -5,6 +5,7 @@
 mod common;
 
 use common::{double_agent, noise_images, position_config, small_config, uniform};
+use cpn::config::{ConvConfig, ImageEncoderConfig};
 use cpn::encoder::Precision;
 use cpn::images;
 use cpn::inner_loop::TensorPlan;
@@ -127,6 +128,38 @@ proptest! {
             assert_close("actions", plan.actions.iter().flatten().copied(), &actions, rounding[0]);
             assert_close("inner_losses", plan.inner_losses.iter().copied(), &losses, rounding[1]);
             assert_eq!(plan.iterations, updates);
+        }
+    }
+}
+
+/// Encoders of one or two convolutions: kernels of one to four strides, or of a pixel more; images that end with a tile, or not.
+fn encoders() -> impl Strategy<Value = ImageEncoderConfig> {
+    let taps = (1i64..5, 1i64..5, 0i64..2).prop_map(|(taps, stride, more)| (taps * stride + more, stride));
+    let convolution = (prop_oneof![Just(16i64), Just(32), Just(5)], taps)
+        .prop_filter("a valid kernel", |(_, (kernel, _))| *kernel <= 8)
+        .prop_map(|(channels, (kernel, stride))| ConvConfig { channels, kernel, stride });
+    proptest::collection::vec(convolution, 1..3).prop_map(|convolutions| ImageEncoderConfig {
+        convolutions,
+        latent: 6,
+        layer_norm: true,
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn encoders_of_all_shapes_are_those_of_libtorch(encoder in encoders(), rows in 1usize..8, seed in 0u64..1000) {
+        let config = ModelConfig { encoder: EncoderConfig::Image(encoder), ..small_config(MethodKind::Upn) };
+        let (agent, mut planner) = both(config, 1.0, 1);
+        let images = noise_images(rows as i64, seed);
+        let reference = agent.encode(&images);
+        let bytes: Vec<u8> = Vec::try_from(images.flatten(0, -1)).unwrap();
+        let inputs: Vec<_> = bytes.chunks_exact(images::BYTES).map(Observed::Image).collect();
+        let together = planner.encode(&inputs);
+        for (row, x) in together.iter().enumerate() {
+            assert_close("x", x.iter().copied(), &floats(&reference.get(row as i64)), 0.0);
+            assert_eq!(planner.encode(&inputs[row..=row]), together[row..=row], "alone as among others");
         }
     }
 }

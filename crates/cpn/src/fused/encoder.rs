@@ -1,18 +1,21 @@
-//! The encoder f_φ for planning: convolutions as products with patches of the image.
+//! The encoder f_φ for planning.
 
+use super::convolution::{self, Convolution, turn};
 use super::gate::rectify;
-use super::lanes::{Aligned, zeros};
+use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, Weights};
-use super::matrix::Panels;
-use super::product::{Left, multiply};
 use super::real::Real;
+use super::winograd::BEYOND;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
-use crate::images::{CHANNELS, SIZE};
+use crate::images::{BYTES, CHANNELS, SIZE};
 use crate::method::Observed;
 use pulp::{Arch, Simd, WithSimd};
 
 /// What layer normalisation adds to the variance, as libtorch does.
 const EPSILON: f64 = 1e-5;
+/// Inputs that go through the layers at once: with more of them weights are read less often, with fewer what a layer leaves lies
+/// nearer.
+const INPUTS: usize = 4;
 
 /// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]
@@ -29,19 +32,6 @@ enum Body<T> {
     Position { centre_metres: [f64; 3], scale_metres: T, layers: Vec<Linear<T>> },
 }
 
-/// A convolution over an image whose channels lie together, `[S, S, C]`, and a rectified linear unit.
-#[derive(Debug)]
-struct Convolution<T> {
-    /// Where each of the patches begins, `[S' S']`.
-    starts: Vec<usize>,
-    /// Where its numbers lie from there on, `[K K C]`.
-    places: Vec<usize>,
-    /// `[K K C, O]`.
-    weight: Panels<T>,
-    /// `[O]`.
-    bias: Vec<T>,
-}
-
 /// Layer normalisation, `[Z]`.
 #[derive(Debug)]
 struct Norm<T> {
@@ -49,11 +39,14 @@ struct Norm<T> {
     bias: Vec<T>,
 }
 
-/// Room for the passes, kept from image to image.
+/// Room for the passes, kept from input to input.
 #[derive(Debug)]
 pub struct Room<T> {
+    /// What a layer takes, with some numbers behind it.
     x: Aligned<T>,
+    /// What it gives.
     y: Aligned<T>,
+    convolution: convolution::Room<T>,
     /// Of all inputs, `[R, F]`.
     features: Aligned<T>,
 }
@@ -61,7 +54,7 @@ pub struct Room<T> {
 impl<T: Real> Room<T> {
     /// Empty.
     pub fn new() -> Self {
-        Self { x: zeros(0), y: zeros(0), features: zeros(0) }
+        Self { x: zeros(0), y: zeros(0), convolution: convolution::Room::new(), features: zeros(0) }
     }
 }
 
@@ -86,9 +79,9 @@ impl<T: Real> Encoder<T> {
     /// Embeds images of 84 x 84 or positions, whichever it takes, as `[Z]` each.
     pub fn encode(&self, inputs: &[Observed<'_>], room: &mut Room<T>) -> Vec<Vec<T>> {
         room.features.clear();
-        for input in inputs {
-            self.body.features(*input, room);
-            room.features.extend_from_slice(&room.x);
+        for inputs in inputs.chunks(INPUTS) {
+            self.body.features(inputs, room);
+            room.features.extend_from_slice(&room.x[..inputs.len() * self.linear.inputs]);
         }
         let mut embeddings = vec![T::ZERO; inputs.len() * self.linear.outputs];
         self.linear.forward(&room.features, &mut embeddings);
@@ -107,7 +100,7 @@ impl<T: Real> Body<T> {
         for (i, conv) in config.convolutions.iter().enumerate() {
             let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
             let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
-            convolutions.push(Convolution::new((side, channels), (kernel, stride), &weight, bias));
+            convolutions.push(Convolution::new((side, channels), (kernel, stride), &weight, &bias));
             (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
         }
         (Self::Image { convolutions }, channels)
@@ -122,57 +115,38 @@ impl<T: Real> Body<T> {
         }
     }
 
-    /// Leaves the features in `room.x`.
-    fn features(&self, input: Observed<'_>, room: &mut Room<T>) {
-        room.x.clear();
-        match (self, input) {
-            (Self::Image { convolutions }, Observed::Image(bytes)) => {
-                room.x.resize(bytes.len(), T::ZERO);
-                Arch::new().dispatch(Scale { bytes, x: &mut room.x });
-                for convolution in convolutions {
-                    convolution.forward(room);
-                    std::mem::swap(&mut room.x, &mut room.y);
+    /// Leaves the features, `[R, F]`, at the beginning of `room.x`.
+    fn features(&self, inputs: &[Observed<'_>], room: &mut Room<T>) {
+        let Room { x, y, convolution, .. } = room;
+        match self {
+            Self::Image { convolutions } => {
+                let numbers = grown(x, inputs.len() * BYTES + BEYOND);
+                for (x, input) in numbers.chunks_exact_mut(BYTES).zip(inputs) {
+                    let Observed::Image(bytes) = input else { panic!("observations are checked as they arrive") };
+                    Arch::new().dispatch(Scale { bytes, x });
+                }
+                for layer in convolutions {
+                    let size = inputs.len() * layer.outputs;
+                    layer.forward(x, &mut grown(y, size + BEYOND)[..size], convolution);
+                    std::mem::swap(x, y);
                 }
             }
-            (Self::Position { centre_metres, scale_metres, layers }, Observed::Position(metres)) => {
-                for (at, centre) in metres.iter().zip(centre_metres) {
-                    room.x.push(T::from_f64(f64::from(*at) - centre) / *scale_metres);
+            Self::Position { centre_metres, scale_metres, layers } => {
+                let numbers = grown(x, inputs.len() * centre_metres.len());
+                for (x, input) in numbers.chunks_exact_mut(centre_metres.len()).zip(inputs) {
+                    let Observed::Position(metres) = input else { panic!("observations are checked as they arrive") };
+                    for (x, (at, centre)) in x.iter_mut().zip(metres.iter().zip(centre_metres)) {
+                        *x = T::from_f64(f64::from(*at) - centre) / *scale_metres;
+                    }
                 }
                 for layer in layers {
-                    room.y.clear();
-                    room.y.resize(layer.outputs, T::ZERO);
-                    layer.forward(&room.x, &mut room.y);
-                    rectify(&mut room.y);
-                    std::mem::swap(&mut room.x, &mut room.y);
+                    let features = grown(y, inputs.len() * layer.outputs);
+                    layer.forward(&x[..inputs.len() * layer.inputs], features);
+                    rectify(features);
+                    std::mem::swap(x, y);
                 }
             }
-            _ => panic!("observations are checked as they arrive"),
         }
-    }
-}
-
-impl<T: Real> Convolution<T> {
-    /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`.
-    fn new((side, channels): (usize, usize), (kernel, stride): (usize, usize), weight: &[T], bias: Vec<T>) -> Self {
-        let size = (side - kernel) / stride + 1;
-        let starts = (0..size).flat_map(|top| (0..size).map(move |left| (top * side + left) * stride * channels));
-        let places = (0..kernel).flat_map(|row| (0..kernel * channels).map(move |at| row * side * channels + at));
-        Self {
-            starts: starts.collect(),
-            places: places.collect(),
-            weight: Panels::transposed(&turn(weight, channels, kernel * kernel), kernel * kernel * channels),
-            bias,
-        }
-    }
-
-    /// `room.x`, `[S, S, C]`, to `room.y`, `[S', S', O]`.
-    fn forward(&self, room: &mut Room<T>) {
-        let Room { x, y, .. } = room;
-        y.clear();
-        self.starts.iter().for_each(|_| y.extend_from_slice(&self.bias));
-        let patches = Left::Patches { image: x, starts: &self.starts, places: &self.places };
-        multiply(true, y, patches, self.weight.matrix(0..self.bias.len()));
-        rectify(y);
     }
 }
 
@@ -205,13 +179,4 @@ impl<T: Real> Norm<T> {
             *x = (*x - mean) * scale * *weight + *bias;
         }
     }
-}
-
-/// Rows `[C, P]`, one after the other, as rows `[P, C]`.
-fn turn<T: Real>(rows: &[T], channels: usize, positions: usize) -> Vec<T> {
-    let row = |row: &[T]| {
-        let at = (0..positions).flat_map(|p| (0..channels).map(move |c| c * positions + p));
-        at.map(|at| row[at]).collect::<Vec<_>>()
-    };
-    rows.chunks_exact(channels * positions).flat_map(row).collect()
 }

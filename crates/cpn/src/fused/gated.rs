@@ -11,7 +11,7 @@
 //! and for v the same with b in place of a and 1 in place of x.
 
 use super::gate::{Gate, GateGradient, GateTape};
-use super::lanes::{Aligned, zeros};
+use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Sigmoid, Tangent};
 use super::real::Real;
@@ -109,11 +109,11 @@ impl<T: Real> Gated<T> {
         x_bar: &mut [T],
     ) {
         let linear = &self.linear;
-        let s_v = room(&mut scratch.v, rows * linear.outputs);
+        let s_v = grown(&mut scratch.v, rows * linear.outputs);
         let v = tape.v.out(rows, &self.v.all());
         for outputs in self.parts(rows) {
             let weights = self.weights(&outputs);
-            let s_u = room(&mut scratch.u, rows * weights.len());
+            let s_u = grown(&mut scratch.u, rows * weights.len());
             let u = tape.u.out(rows, &weights);
             Arch::new().dispatch(Backward { linear, outputs, x, u, v, y_bar, x_bar, s_u, s_v });
             self.u.backward(rows, &weights, s_u, &mut tape.u);
@@ -152,11 +152,11 @@ impl<T: Real> Gated<T> {
         let linear = &self.linear;
         let Linear { inputs, outputs, .. } = *linear;
         let stacked = x.len() / inputs;
-        let s_v = room(&mut scratch.v, stacked * outputs);
+        let s_v = grown(&mut scratch.v, stacked * outputs);
         let v = tape.v.out(rows, &self.v.all());
         for outputs in self.parts(rows) {
             let weights = self.weights(&outputs);
-            let s_u = room(&mut scratch.u, stacked * weights.len());
+            let s_u = grown(&mut scratch.u, stacked * weights.len());
             let u = tape.u.out(rows, &weights);
             if stacked == rows {
                 let (x_hat, s_u, s_v, gradient) = (&mut *x_hat, &mut *s_u, &mut *s_v, &mut *gradient);
@@ -183,12 +183,4 @@ impl<T: Real> Gated<T> {
         self.u.leave_adjoint(rows, x, &mut tape.u, x_hat, &mut gates.u);
         self.v.leave_adjoint(rows, x, &mut tape.v, x_hat, &mut gates.v);
     }
-}
-
-/// So much of a memory, which grows if it must.
-fn room<T: Real>(memory: &mut Aligned<T>, size: usize) -> &mut [T] {
-    if memory.len() < size {
-        memory.resize(size, T::ZERO);
-    }
-    &mut memory[..size]
 }

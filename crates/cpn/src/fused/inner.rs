@@ -19,6 +19,8 @@ pub struct Rollout<T> {
 pub enum Actions {
     /// They are given.
     Given,
+    /// They are those of the rollout before, moved down its loss: the first step sees the same state again.
+    Moved,
     /// The policy proposes them along the way.
     Proposed,
 }
@@ -58,7 +60,9 @@ impl<T: Real> Rollout<T> {
         let horizon = self.steps.len();
         for (t, action) in actions.chunks_mut(rows * network.sizes.actions).take(horizon).enumerate() {
             let step = &mut self.steps[if purpose == Purpose::Loss { 0 } else { t }];
-            network.features(rows, step, x, x_g);
+            if t > 0 || source != Actions::Moved {
+                network.features(rows, step, x, x_g);
+            }
             if source == Actions::Proposed {
                 network.policy(rows, step, action);
             }

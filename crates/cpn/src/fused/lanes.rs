@@ -13,6 +13,30 @@ pub fn zeros<T: Real>(count: usize) -> Aligned<T> {
     avec![T::ZERO; count]
 }
 
+/// So much of a memory, which grows if it must.
+pub fn grown<T: Real>(memory: &mut Aligned<T>, size: usize) -> &mut [T] {
+    if memory.len() < size {
+        memory.resize(size, T::ZERO);
+    }
+    &mut memory[..size]
+}
+
+/// The first `count` registers of each slice.
+#[inline(always)]
+pub fn registers<S: Simd, T: Real, const N: usize>(simd: S, slices: [&[T]; N], count: usize) -> [&[T::Lanes<S>]; N] {
+    slices.map(|slice| &T::registers(simd, slice)[..count])
+}
+
+/// The same, to be written.
+#[inline(always)]
+pub fn registers_mut<S: Simd, T: Real, const N: usize>(
+    simd: S,
+    slices: [&mut [T]; N],
+    count: usize,
+) -> [&mut [T::Lanes<S>]; N] {
+    slices.map(|slice| &mut T::registers_mut(simd, slice)[..count])
+}
+
 /// As many numbers as fill a register.
 #[derive(Debug)]
 pub struct Lanes<S: Simd, T: Real> {
@@ -45,6 +69,22 @@ impl<S: Simd, T: Real> Lanes<S, T> {
         Self { simd, values: T::load(simd, slice) }
     }
 
+    /// Of several registers.
+    #[inline(always)]
+    pub fn each<const N: usize>(simd: S, registers: [T::Lanes<S>; N]) -> [Self; N] {
+        let mut lanes = [Self::splat(simd, T::ZERO); N];
+        for (lanes, values) in lanes.iter_mut().zip(registers) {
+            lanes.values = values;
+        }
+        lanes
+    }
+
+    /// The register.
+    #[inline(always)]
+    pub fn values(self) -> T::Lanes<S> {
+        self.values
+    }
+
     /// Of several slices the first numbers each.
     #[inline(always)]
     pub fn load_each<const N: usize>(simd: S, slices: [&[T]; N]) -> [Self; N] {
@@ -72,6 +112,12 @@ impl<S: Simd, T: Real> Lanes<S, T> {
     #[inline(always)]
     pub fn mul_add(self, factor: Self, summand: Self) -> Self {
         Self { values: T::mul_add(self.simd, self.values, factor.values, summand.values), ..self }
+    }
+
+    /// relu of each. What is not a number stays so, for somebody to see.
+    #[inline(always)]
+    pub fn rectified(self) -> Self {
+        Self { values: T::max_lanes(self.simd, T::splat(self.simd, T::ZERO), self.values), ..self }
     }
 
     /// σ of each.

@@ -19,7 +19,8 @@ pub struct Matrix<'a, T> {
     pub stride: usize,
     /// From a panel to the next.
     pub apart: usize,
-    /// Rows whose panels all go on to their ends; past b's end there may be nothing to fill the registers with.
+    /// Rows whose panels all go on to their ends, into the next row or not; past b's end there may be nothing to fill the
+    /// registers with.
     pub whole: usize,
 }
 
@@ -28,7 +29,7 @@ impl<'a, T: Real> Matrix<'a, T> {
     pub fn new(values: &'a [T], columns: usize) -> Self {
         let (inner, width) = (values.len() / columns, Shape::of::<T>().width);
         let beyond = columns.next_multiple_of(width) - columns;
-        let whole = inner.saturating_sub(beyond.div_ceil(columns));
+        let whole = if columns < width { 0 } else { inner.saturating_sub(beyond.div_ceil(columns)) };
         Self { values, inner, columns, stride: columns, apart: width, whole }
     }
 }

@@ -16,6 +16,7 @@
 //! A block of samples goes through everything before the next one does, so that its tapes stay in the processor's caches.
 //! Tested against autograd in float64 (`tests/fused.rs`).
 
+mod convolution;
 mod dense;
 mod encoder;
 mod gate;
@@ -31,6 +32,7 @@ mod planner;
 mod product;
 mod real;
 mod sampling;
+mod winograd;
 
 pub use linear::{Weights, add};
 pub use outer::Samples;

@@ -3,7 +3,7 @@
 //! Each kernel runs over R samples and some of the outputs; `a` is `[outputs, inputs]`, what belongs to u is `[R, some outputs,
 //! inputs]`, the rest `[R, inputs]` or `[R, outputs]`.
 
-use super::lanes::Lanes;
+use super::lanes::{Lanes, registers, registers_mut};
 use super::linear::{Linear, LinearGradient};
 use super::real::Real;
 use pulp::{Simd, WithSimd};
@@ -56,17 +56,39 @@ impl<T: Real> WithSimd for Forward<'_, T> {
                 let u = &mut u[(r * part.len() + j) * inputs..][..inputs];
                 let row = j * inputs..(j + 1) * inputs;
                 let (u_bias, a) = (&u_bias[row.clone()], &weight[row]);
-                let mut sum = Lanes::splat(simd, T::ZERO);
-                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [s, bias, a, x] = Lanes::load_each(simd, [&u[i..], &u_bias[i..], &a[i..], &x[i..]]);
-                    let open = (s + bias).sigmoid();
-                    open.store(&mut u[i..]);
-                    sum = (open * a).mul_add(x, sum);
-                }
+                let sum = open(simd, u, [u_bias, a, x]);
                 y[at] = sum.sum() + v[at] * linear.bias()[o];
             }
         }
     }
+}
+
+/// Turns a row of s - b₂ into u, and answers Σ u a x, yet to be summed over the lanes.
+#[inline(always)]
+fn open<S: Simd, T: Real>(simd: S, u: &mut [T], [bias, a, x]: [&[T]; 3]) -> Lanes<S, T> {
+    let mut sum = Lanes::splat(simd, T::ZERO);
+    let count = u.len() / Lanes::<S, T>::COUNT;
+    {
+        // Slices of registers, all as long, are read without looking for their ends each time.
+        let [u] = registers_mut(simd, [&mut *u], count);
+        let [bias, a, x] = registers(simd, [bias, a, x], count);
+        for i in 0..count {
+            u[i] = open_lanes(Lanes::each(simd, [u[i], bias[i], a[i], x[i]]), &mut sum).values();
+        }
+    }
+    let rest = count * Lanes::<S, T>::COUNT..u.len();
+    if !rest.is_empty() {
+        let rows = [&u[rest.clone()], &bias[rest.clone()], &a[rest.clone()], &x[rest.clone()]];
+        open_lanes(Lanes::load_each(simd, rows), &mut sum).store(&mut u[rest]);
+    }
+    sum
+}
+
+#[inline(always)]
+fn open_lanes<S: Simd, T: Real>([s, bias, a, x]: [Lanes<S, T>; 4], sum: &mut Lanes<S, T>) -> Lanes<S, T> {
+    let open = (s + bias).sigmoid();
+    *sum = (open * a).mul_add(x, *sum);
+    open
 }
 
 /// Adds to x̄; s̄ of both gates.

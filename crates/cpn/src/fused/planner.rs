@@ -14,7 +14,7 @@ use crate::images;
 use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
 use rayon::prelude::*;
 
-/// R, the plans of a block, for which another thread is worth waking.
+/// R, the plans of a block: with more of them weights are read less often, with fewer what the passes leave lies nearer.
 pub(super) const BLOCK: usize = 16;
 
 /// A learned method as it is served: its weights laid out for planning, in float32. What it plans is what autograd plans from
@@ -175,7 +175,7 @@ impl Worker<f32> {
             done += 1;
             self.descend(dynamics, rows);
             let purpose = if iterations.ends_at(done) { Purpose::Loss } else { Purpose::Gradient };
-            let losses: Vec<f32> = self.roll_out(dynamics, (Actions::Given, purpose), ends()).collect();
+            let losses: Vec<f32> = self.roll_out(dynamics, (Actions::Moved, purpose), ends()).collect();
             for (r, (plan, loss)) in plans.iter_mut().zip(losses).enumerate() {
                 let best = plan.inner_losses[plan.inner_losses.len() - 1];
                 let better = loss < best || !iterations.keep_best();

@@ -39,26 +39,20 @@ pub enum Left<'a, T> {
     Rows(&'a [T]),
     /// `[inner, rows]`.
     Turned(&'a [T]),
-    /// Patches of an image: a row's numbers lie at the same `places`, in ascending order, from a start of its own on.
-    Patches { image: &'a [T], starts: &'a [usize], places: &'a [usize] },
-}
-
-impl<T> Left<'_, T> {
-    fn has_shape(&self, rows: usize, inner: usize) -> bool {
-        match self {
-            Left::Rows(values) | Left::Turned(values) => values.len() == rows * inner,
-            Left::Patches { starts, places, .. } => starts.len() == rows && places.len() == inner,
-        }
-    }
 }
 
 /// Sums in registers: of R rows, at P panels.
 type Sums<S, T, const R: usize, const P: usize> = [[[Lanes<S, T>; REGISTERS]; P]; R];
 
+/// Places along the inner dimension, each with b's numbers there, from a panel's row on, for P panels: first those of whole
+/// rows, then those where b may end within a register.
+type Place<'a, T, const P: usize> = (usize, [&'a [T]; P]);
+
 impl<T: Real> Product<'_, T> {
     fn run(&mut self) {
         let (rows, Matrix { inner, columns, .. }) = (self.rows, self.b);
-        assert!(self.c.len() == rows * columns && self.a.has_shape(rows, inner), "shapes of a product");
+        let (Left::Rows(a) | Left::Turned(a)) = self.a;
+        assert!(self.c.len() == rows * columns && a.len() == rows * inner, "shapes of a product");
         // As many rows at once as there are registers for their sums, a part of b and a number of a.
         let mut row = 0;
         if Shape::of::<T>().registers >= 32 {
@@ -82,14 +76,14 @@ impl<T: Real> Product<'_, T> {
     }
 
     /// Of R rows of c, at P panels, the part that some places along the inner dimension give: as the first, or added to what
-    /// is there. The places are those of whole rows of b, and others. `room` is for what juts out over c's right edge.
+    /// is there. `room` is for what juts out over c's right edge.
     #[inline(always)]
-    fn tile<S: Simd, const R: usize, const P: usize>(
+    fn tile<'a, S: Simd, const R: usize, const P: usize>(
         &mut self,
         simd: S,
         (row, panel): (usize, usize),
         first: bool,
-        places: [impl Iterator<Item = usize>; 2],
+        places: [impl Iterator<Item = Place<'a, T, P>>; 2],
         room: &mut [T; TILE],
     ) {
         let (columns, count) = (self.b.columns, Lanes::<S, T>::COUNT);
@@ -113,7 +107,7 @@ impl<T: Real> Product<'_, T> {
                 }
             }
         }
-        sums = along(simd, sums, (self.a, row, self.rows), (self.b, panel), places);
+        sums = along(simd, sums, (self.a, row, self.rows), places);
         for (r, sums) in sums.iter().enumerate() {
             let line = &mut c[r * stride..][..width];
             for (part, sum) in line.chunks_exact_mut(count).zip(sums.as_flattened()) {
@@ -142,11 +136,16 @@ impl<T: Real, const R: usize> WithSimd for Tiles<'_, '_, T, R> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { product, rows } = self;
-        let Matrix { inner, whole, columns, .. } = product.b;
+        let b = product.b;
         let mut room = [T::ZERO; TILE];
-        for panel in 0..columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
+        for panel in 0..b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
+            let lines = |places: Range<usize>| {
+                let values = b.values.get(panel * b.apart + places.start * b.stride..).unwrap_or_default();
+                places.zip(values.chunks(b.stride)).map(|(k, line)| (k, [line]))
+            };
             for row in rows.clone().step_by(R) {
-                product.tile::<S, R, 1>(simd, (row, panel), !product.accumulate, [0..whole, whole..inner], &mut room);
+                let places = [lines(0..b.whole), lines(b.whole..b.inner)];
+                product.tile::<S, R, 1>(simd, (row, panel), !product.accumulate, places, &mut room);
             }
         }
     }
@@ -197,74 +196,82 @@ impl<T: Real> Row<'_, '_, T> {
         let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
         let mut panel = 0;
         while panel + 4 <= panels {
-            self.product.tile::<S, 1, 4>(simd, (self.row, panel), first, places.clone(), room);
+            self.some::<S, 4>(simd, panel, first, places.clone(), room);
             panel += 4;
         }
         while panel + 2 <= panels {
-            self.product.tile::<S, 1, 2>(simd, (self.row, panel), first, places.clone(), room);
+            self.some::<S, 2>(simd, panel, first, places.clone(), room);
             panel += 2;
         }
         if panel < panels {
-            self.product.tile::<S, 1, 1>(simd, (self.row, panel), first, places, room);
+            self.some::<S, 1>(simd, panel, first, places, room);
         }
+    }
+
+    #[inline(always)]
+    fn some<S: Simd, const P: usize>(
+        &mut self,
+        simd: S,
+        panel: usize,
+        first: bool,
+        [whole, rest]: [impl Iterator<Item = usize>; 2],
+        room: &mut [T; TILE],
+    ) {
+        let b = self.product.b;
+        let mut panels = [b.values; P];
+        for (p, values) in panels.iter_mut().enumerate() {
+            *values = &b.values[(panel + p) * b.apart..];
+        }
+        let lines = |k: usize| {
+            let mut lines = panels;
+            for line in &mut lines {
+                *line = &line[k * b.stride..];
+            }
+            (k, lines)
+        };
+        self.product.tile::<S, 1, P>(simd, (self.row, panel), first, [whole.map(lines), rest.map(lines)], room);
     }
 }
 
 /// Adds to sums what some places along the inner dimension give.
 #[inline(always)]
-fn along<S: Simd, T: Real, const R: usize, const P: usize>(
+fn along<'a, S: Simd, T: Real, const R: usize, const P: usize>(
     simd: S,
     mut sums: Sums<S, T, R, P>,
     (a, row, count): (Left<'_, T>, usize, usize),
-    (b, panel): (Matrix<'_, T>, usize),
-    [whole, rest]: [impl Iterator<Item = usize>; 2],
+    [whole, rest]: [impl Iterator<Item = Place<'a, T, P>>; 2],
 ) -> Sums<S, T, R, P> {
-    let mut panels = [b.values; P];
-    for (p, values) in panels.iter_mut().enumerate() {
-        *values = &b.values[(panel + p) * b.apart..];
-    }
-    let (inner, b) = (b.inner, (panels, b.stride));
     match a {
         Left::Rows(values) => {
+            let inner = values.len() / count;
             let mut rows = [values; R];
             for (r, values) in rows.iter_mut().enumerate() {
                 *values = &values[(row + r) * inner..][..inner];
             }
             let a = |r: usize, k: usize| rows[r][k];
-            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
-            add::<S, T, R, P, false>(simd, sums, rest, a, b)
+            sums = add::<S, T, R, P, true>(simd, sums, whole, a);
+            add::<S, T, R, P, false>(simd, sums, rest, a)
         }
         Left::Turned(values) => {
             let a = |r: usize, k: usize| values[row + k * count..][..R][r];
-            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
-            add::<S, T, R, P, false>(simd, sums, rest, a, b)
-        }
-        Left::Patches { image, starts, places } => {
-            let (mut rows, size) = ([image; R], places[inner - 1] + 1);
-            for (values, start) in rows.iter_mut().zip(&starts[row..][..R]) {
-                *values = &values[*start..][..size];
-            }
-            let a = |r: usize, k: usize| rows[r][places[k]];
-            sums = add::<S, T, R, P, true>(simd, sums, whole, a, b);
-            add::<S, T, R, P, false>(simd, sums, rest, a, b)
+            sums = add::<S, T, R, P, true>(simd, sums, whole, a);
+            add::<S, T, R, P, false>(simd, sums, rest, a)
         }
     }
 }
 
-/// Adds to the sums, for each place k along the inner dimension, R numbers of a, which `a` answers, times P panels of b, whose
-/// rows are `stride` apart and, if they are not WHOLE, may end within a register.
+/// Adds to the sums, for each place, R numbers of a, which `a` answers, times P panels of b, whose rows may end within a
+/// register if they are not WHOLE.
 #[inline(always)]
-fn add<S: Simd, T: Real, const R: usize, const P: usize, const WHOLE: bool>(
+fn add<'a, S: Simd, T: Real, const R: usize, const P: usize, const WHOLE: bool>(
     simd: S,
     mut sums: Sums<S, T, R, P>,
-    places: impl Iterator<Item = usize>,
+    places: impl Iterator<Item = Place<'a, T, P>>,
     a: impl Fn(usize, usize) -> T,
-    (b, stride): ([&[T]; P], usize),
 ) -> Sums<S, T, R, P> {
     let count = Lanes::<S, T>::COUNT;
-    for k in places {
-        for (p, b) in b.iter().enumerate() {
-            let mut line = &b[k * stride..];
+    for (k, lines) in places {
+        for (p, mut line) in lines.into_iter().enumerate() {
             if WHOLE {
                 line = &line[..REGISTERS * count];
             }

@@ -49,6 +49,10 @@ pub trait Real:
     fn load<S: Simd>(simd: S, slice: &[Self]) -> Self::Lanes<S>;
     /// Writes over the first numbers of a slice, as many as it has.
     fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: Self::Lanes<S>);
+    /// As many whole registers as a slice fills.
+    fn registers<S: Simd>(simd: S, slice: &[Self]) -> &[Self::Lanes<S>];
+    /// The same, to be written.
+    fn registers_mut<S: Simd>(simd: S, slice: &mut [Self]) -> &mut [Self::Lanes<S>];
     /// a + b.
     fn add_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
     /// a - b.
@@ -57,6 +61,8 @@ pub trait Real:
     fn mul_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
     /// a b + c.
     fn mul_add<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>, c: Self::Lanes<S>) -> Self::Lanes<S>;
+    /// The larger of a and b; b where one is not a number.
+    fn max_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
     /// The sum of all.
     fn sum_lanes<S: Simd>(simd: S, lanes: Self::Lanes<S>) -> Self;
     /// σ of each.
@@ -66,7 +72,7 @@ pub trait Real:
 /// What differs between the two kinds only in the names of the library's functions.
 macro_rules! real {
     ($real:ident, $lanes:ident, $count:ident, $splat:ident, $as_simd:ident, $as_mut_simd:ident, $partial_load:ident, $partial_store:ident, $add:ident, $sub:ident,
-     $mul:ident, $mul_add:ident, $sum:ident) => {
+     $mul:ident, $mul_add:ident, $max:ident, $sum:ident) => {
         const ZERO: Self = 0.0;
         const ONE: Self = 1.0;
         type Lanes<S: Simd> = S::$lanes;
@@ -123,6 +129,16 @@ macro_rules! real {
         }
 
         #[inline(always)]
+        fn registers<S: Simd>(_: S, slice: &[Self]) -> &[S::$lanes] {
+            S::$as_simd(slice).0
+        }
+
+        #[inline(always)]
+        fn registers_mut<S: Simd>(_: S, slice: &mut [Self]) -> &mut [S::$lanes] {
+            S::$as_mut_simd(slice).0
+        }
+
+        #[inline(always)]
         fn add_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
             simd.$add(a, b)
         }
@@ -140,6 +156,11 @@ macro_rules! real {
         #[inline(always)]
         fn mul_add<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes, c: S::$lanes) -> S::$lanes {
             simd.$mul_add(a, b, c)
+        }
+
+        #[inline(always)]
+        fn max_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+            simd.$max(a, b)
         }
 
         #[inline(always)]
@@ -163,6 +184,7 @@ impl Real for f64 {
         sub_f64s,
         mul_f64s,
         mul_add_f64s,
+        max_f64s,
         reduce_sum_f64s
     );
 
@@ -189,6 +211,7 @@ impl Real for f32 {
         sub_f32s,
         mul_f32s,
         mul_add_f32s,
+        max_f32s,
         reduce_sum_f32s
     );
 

@@ -62,7 +62,7 @@ pub fn plan(
             worker.set_plan(dynamics, 1, 0, &belief.mean);
             roll_out(worker, dynamics, query, (Actions::Given, Purpose::Gradient));
             worker.descend(dynamics, 1);
-            let loss = roll_out(worker, dynamics, query, (Actions::Given, Purpose::Loss));
+            let loss = roll_out(worker, dynamics, query, (Actions::Moved, Purpose::Loss));
             let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
             if descended.loss < nearest.loss {
                 belief.mean.clone_from(&descended.actions);
