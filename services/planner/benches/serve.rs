@@ -1,5 +1,5 @@
 //! The service's side of `make bench-plan`: a planner in a process of its own, and clients that ask it for plans one after the
-//! other. Each measurement is a line of JSON.
+//! other. Each measurement is a line of JSON; those of a turn at as many clients follow each other at once, to be compared.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
@@ -10,7 +10,6 @@ use cpn::{Method, checkpoint};
 use futures::future::join_all;
 use planner::core::PlannerCore;
 use serde_json::{Value, json};
-use service_kit::SessionConfig;
 use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -39,8 +38,11 @@ struct Args {
     #[arg(long)]
     out: PathBuf,
     /// How long each measurement takes.
-    #[arg(long, default_value_t = 5.0)]
+    #[arg(long, default_value_t = 1.0)]
     seconds: f64,
+    /// How often each is taken.
+    #[arg(long, default_value_t = 5)]
+    turns: u32,
     /// What `cargo bench` says.
     #[arg(long, hide = true)]
     bench: bool,
@@ -56,7 +58,15 @@ impl Drop for Process {
     }
 }
 
-/// One way to reach the planner.
+/// A planner in a process of its own.
+struct Server {
+    _process: Process,
+    /// Where zenoh and gRPC are.
+    endpoints: [String; 2],
+    shared_memory: bool,
+}
+
+/// One way to reach a planner.
 #[derive(Clone)]
 enum Client {
     InProcess(PlannerCore),
@@ -65,6 +75,25 @@ enum Client {
 }
 
 impl Client {
+    /// As robots join that only ask: by a session each, which knows none but the planner.
+    async fn zenoh(Server { endpoints: [endpoint, _], shared_memory, .. }: &Server) -> Self {
+        let mut config = zenoh::Config::default();
+        for (key, value) in [
+            ("mode", json!("client")),
+            ("connect/endpoints", json!([endpoint])),
+            ("connect/timeout_ms", json!(PATIENCE.as_millis() as u64)),
+            ("scouting/multicast/enabled", json!(false)),
+            ("transport/shared_memory/enabled", json!(shared_memory)),
+        ] {
+            config.insert_json5(key, &value.to_string()).unwrap();
+        }
+        Self::Zenoh(zenoh::open(config).await.unwrap(), key::planner_plan(NAME).unwrap())
+    }
+
+    async fn grpc(Server { endpoints: [_, endpoint], .. }: &Server) -> Self {
+        Self::Grpc(PlannerServiceClient::connect(endpoint.clone()).await.unwrap())
+    }
+
     async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
         match self {
             Self::InProcess(core) => core.plan(request).await,
@@ -84,40 +113,25 @@ async fn main() {
     };
     let duration = Duration::from_secs_f64(args.seconds);
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
-    for clients in CLIENTS {
-        tell(batches(&models, clients, duration));
+    let (tcp, goal) = start(&models, false).await;
+    let (shared, same_goal) = start(&models, true).await;
+    let grpc_listen = ([127, 0, 0, 1], 0).into();
+    let planner = planner::Config { models_dir: models.clone(), grpc_listen, ..Default::default() };
+    let planner = planner::start(planner).await.unwrap();
+    let here = planner.core().register_goal(RegisterGoalRequest { image: image(0) }).unwrap().goal_id;
+    assert!(goal == same_goal && goal == here, "a goal's id is what is in its picture");
+    for (_, count) in (0..args.turns).flat_map(|turn| CLIENTS.map(|count| (turn, count))) {
+        tell(batches(&models, count, duration));
+        let clients = join_all((0..count).map(|_| Client::zenoh(&tcp))).await;
+        tell(closed_loop("zenoh tcp", clients, &goal, duration).await);
+        let clients = join_all((0..count).map(|_| Client::zenoh(&shared))).await;
+        tell(closed_loop("zenoh shared memory", clients, &goal, duration).await);
+        let clients = join_all((0..count).map(|_| Client::grpc(&tcp))).await;
+        tell(closed_loop("gRPC", clients, &goal, duration).await);
+        let clients = vec![Client::InProcess(planner.core()); count];
+        tell(closed_loop("in-process service", clients, &goal, duration).await);
     }
-    for shared_memory in [false, true] {
-        let transport = if shared_memory { "zenoh shared memory" } else { "zenoh tcp" };
-        let (_process, session, grpc) = start(&models, shared_memory).await;
-        let key = key::planner_plan(NAME).unwrap();
-        let goal = register(&session).await;
-        for count in CLIENTS {
-            let mut clients = Vec::new();
-            for _ in 0..count {
-                let session = service_kit::session::open(&session.1).await.unwrap();
-                clients.push(Client::Zenoh(session, key.clone()));
-            }
-            tell(closed_loop(transport, clients, &goal, duration).await);
-        }
-        if shared_memory {
-            continue;
-        }
-        for count in CLIENTS {
-            let connect = || async { PlannerServiceClient::connect(grpc.clone()).await.unwrap() };
-            let clients = join_all((0..count).map(|_| connect())).await.into_iter().map(Client::Grpc).collect();
-            tell(closed_loop("gRPC", clients, &goal, duration).await);
-        }
-        let client = Client::Zenoh(session.0.clone(), key);
-        tell(overload(client, &goal, duration).await);
-    }
-    let config = planner::Config { models_dir: models, grpc_listen: ([127, 0, 0, 1], 0).into(), ..Default::default() };
-    let planner = planner::start(config).await.unwrap();
-    let client = Client::InProcess(planner.core());
-    let goal = planner.core().register_goal(RegisterGoalRequest { image: image(0) }).unwrap().goal_id;
-    for count in CLIENTS {
-        tell(closed_loop("in-process service", vec![client.clone(); count], &goal, duration).await);
-    }
+    tell(overload(Client::zenoh(&tcp).await, &goal, duration * args.turns).await);
     planner.shutdown().await.unwrap();
 }
 
@@ -212,8 +226,8 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
     })
 }
 
-/// Starts a planner, and joins it.
-async fn start(models: &Path, shared_memory: bool) -> (Process, (Session, SessionConfig), String) {
+/// Starts a planner, and registers a goal with it; answers its id.
+async fn start(models: &Path, shared_memory: bool) -> (Server, String) {
     let free = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let (zenoh, grpc) = (format!("tcp/{}", free()), free());
     let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-planner"));
@@ -222,18 +236,14 @@ async fn start(models: &Path, shared_memory: bool) -> (Process, (Session, Sessio
         command.arg("--shared-memory");
     }
     let process = Process(command.env("RUST_LOG", "warn").spawn().unwrap());
-    let config = SessionConfig { connect: vec![zenoh], shared_memory, ..SessionConfig::default() };
-    let session = service_kit::session::open(&config).await.unwrap();
+    let server = Server { _process: process, endpoints: [zenoh, format!("http://{grpc}")], shared_memory };
+    let Client::Zenoh(session, _) = Client::zenoh(&server).await else { unreachable!("asked for") };
     let alive = session.liveliness().declare_subscriber(key::planner_alive(NAME).unwrap()).history(true).await.unwrap();
     tokio::time::timeout(PATIENCE, alive.recv_async()).await.unwrap().unwrap();
-    (process, (session, config), format!("http://{grpc}"))
-}
-
-async fn register((session, _): &(Session, SessionConfig)) -> String {
-    let key = key::planner_register_goal(NAME).unwrap();
     let request = RegisterGoalRequest { image: image(0) };
-    let response: wire::planner::RegisterGoalResponse = query::call(session, &key, request, PATIENCE).await.unwrap();
-    response.goal_id
+    let key = key::planner_register_goal(NAME).unwrap();
+    let response: wire::planner::RegisterGoalResponse = query::call(&session, &key, request, PATIENCE).await.unwrap();
+    (server, response.goal_id)
 }
 
 fn request(goal: &str, frame: u8) -> PlanRequest {

@@ -136,17 +136,21 @@ def take_turns(started: Sequence[Contender], effort: Effort) -> NDArray[np.float
     return np.array([[contender.turn() for contender in started] for _ in range(effort.turns)])
 
 
+def median(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The median over turns, and the ends of its 95 % bootstrap interval."""
+    interval = bootstrap((values,), np.median, rng=0).confidence_interval
+    return float(np.median(values)), float(interval.low), float(interval.high)
+
+
 def tell(name: str, peers: Sequence[str], rates: NDArray[np.float64], unit: str, command: str) -> list[Row]:
     """Prints and answers a row for each peer, of rates in this unit `[turns, 1 + peers]` of which ours is the first."""
     own, *others = np.median(rates, axis=0)
     rows = []
     for column, (peer, other) in enumerate(zip(peers, others, strict=True), 1):
-        ratios = rates[:, 0] / rates[:, column]
-        interval = bootstrap((ratios,), np.median, rng=0).confidence_interval
-        ratio = float(np.median(ratios))
+        ratio, low, high = median(rates[:, 0] / rates[:, column])
         print(
             f"{name:24s} {own:8.0f} {unit}, {peer:{max(map(len, peers))}s} {other:8.0f}: {ratio:6.2f} times "
-            f"({interval.low:.2f} to {interval.high:.2f}, n = {len(rates)})",
+            f"({low:.2f} to {high:.2f}, n = {len(rates)})",
             flush=True,
         )
         rows.append(Row(name, float(own), float(other), peer, ratio, unit, len(rates), command))

@@ -76,8 +76,25 @@ def test_our_service_is_measured_by_its_bench() -> None:
     overload = Overload(4.0, 10.0, 100, 40, 9, 9, 30, 1, 0.2, 0.3)
     lines = json.dumps(line | {"server_ms_p50": 0.5}) + "\n" + json.dumps(asdict(overload))
     script = f"import sys, pathlib; pathlib.Path(sys.argv[2]).write_text({lines!r} + chr(10))"
-    measured = service.ours([sys.executable, "-c", script], seconds=1.0)
+    measured = service.ours([sys.executable, "-c", script], seconds=1.0, turns=1)
     assert measured == ([Measurement("gRPC", 1, 2.0, 1.0, 3.0, 9, 0.5)], overload)
+
+
+def test_what_a_service_costs_is_told_turn_by_turn(capfd: pytest.CaptureFixture[str]) -> None:
+    # In three turns the machine is slow, fast and in between.
+    turns = [
+        Measurement(transport, clients, rate * speed, p50, 2 * p50, 10, server)
+        for speed, share, wait in ((1.0, 0.7, 0.4), (3.0, 0.8, 0.5), (2.0, 0.9, 0.6))
+        for transport, rate, p50, server in ((service.LIBRARY, 100.0, 1.0, 1.0), ("gRPC", 100.0 * share, 1 + wait, 1.0))
+        for clients in (1, 32)
+    ]
+    service.tell_cost(turns)
+    printed = capfd.readouterr().out
+    assert "gRPC                 adds 0.50 ms (0.40 to 0.60) to a plan at 1 client" in printed
+    assert "with 32 has 80% (70% to 90%) of the plans/s of the library alone (n = 3)" in printed
+    library, _, grpc, _ = service.medians(turns)
+    assert (library.plans_per_second, library.n) == (200.0, 30)
+    assert grpc == Measurement("gRPC", 1, 180.0, 1.5, 3.0, 30, 1.0)
 
 
 def test_services_become_rows() -> None:

@@ -42,7 +42,6 @@ UNIT = "plans/s"
 BFLOAT16 = "ours, bfloat16"
 RELATIVE_TOLERANCE = ABSOLUTE_TOLERANCE = 1e-3
 """Between the first plans of contenders."""
-LOAD_SECONDS, QUICK_LOAD_SECONDS = 5.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -169,11 +168,11 @@ def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
                 keep(compare(command, (EAGER, JAX), Setting("cpn", grown=grown, value=value), CURVE))
         chart.draw(rows, GROWTH, f"{UNIT}, batch 1, one thread", out / "plan.svg")
     with written_model(command, Setting("cpn")) as path:
-        seconds = QUICK_LOAD_SECONDS if quick else LOAD_SECONDS
-        measured, overload = service.ours(shlex.split(serve), seconds)
-        measured += service.litserve(path, seconds)
+        load = QUICK if quick else CURVE
+        turns, overload = service.ours(shlex.split(serve), load.turn_seconds, load.turns)
+        measured = service.medians(turns) + service.litserve(path, load.turns * load.turn_seconds)
     service.tell(measured)
-    service.tell_cost(measured)
+    service.tell_cost(turns)
     service.tell_overload(overload)
     keep(service.rows(measured, COMMAND))
     load_chart.draw(measured, out / "load.svg")

@@ -15,7 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from cpn_bench.harness import ENVIRONMENT, Row, module
+import numpy as np
+
+from cpn_bench.harness import ENVIRONMENT, Row, median, module
 
 LITSERVE = "LitServe + PyTorch"
 LIBRARY = "library"
@@ -62,11 +64,12 @@ class Overload:
     refused_p99_ms: float
 
 
-def ours(command: Sequence[str], seconds: float) -> tuple[list[Measurement], Overload]:
-    """Has our bench measure our service over every transport, for so many seconds each."""
+def ours(command: Sequence[str], seconds: float, turns: int) -> tuple[list[Measurement], Overload]:
+    """Has our bench measure our service over every transport, in so many turns of so many seconds each."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "load.jsonl"
-        subprocess.run([*command, "--out", str(path), "--seconds", str(seconds)], check=True, stdout=sys.stderr)
+        options = ["--out", str(path), "--seconds", str(seconds), "--turns", str(turns)]
+        subprocess.run([*command, *options], check=True, stdout=sys.stderr)
         lines = [json.loads(line) for line in path.read_text().splitlines()]
     (overload,) = [Overload(**line) for line in lines if "overload" in line]
     return [Measurement(**line) for line in lines if "overload" not in line], overload
@@ -140,15 +143,35 @@ def tell_overload(o: Overload) -> None:
     )
 
 
+def medians(measured: Sequence[Measurement]) -> list[Measurement]:
+    """Of the turns of each transport with so many clients."""
+    turns: dict[tuple[str, int], list[Measurement]] = {}
+    for m in measured:
+        turns.setdefault((m.transport, m.clients), []).append(m)
+
+    def over(of: Sequence[Measurement]) -> Measurement:
+        rate, p50, p99 = np.median([(m.plans_per_second, m.p50_ms, m.p99_ms) for m in of], axis=0)
+        servers = [m.server_ms_p50 for m in of if m.server_ms_p50 is not None]
+        server, n = float(np.median(servers)) if servers else None, sum(m.n for m in of)
+        return Measurement(of[0].transport, of[0].clients, float(rate), float(p50), float(p99), n, server)
+
+    return [over(of) for of in turns.values()]
+
+
 def tell_cost(measured: Sequence[Measurement]) -> None:
-    """Prints what the service adds to the plans themselves, for one client and for many."""
-    of = {(m.transport, m.clients): m for m in measured}
-    library = of[LIBRARY, MANY].plans_per_second
-    for transport in (m.transport for m in measured if m.clients == FEW and m.server_ms_p50 is not None):
-        one, many = of[transport, FEW], of[transport, MANY]
+    """Prints what the service adds to plans, for one client and for many, from turns beside the library's."""
+
+    def turns(transport: str, clients: int) -> list[Measurement]:
+        return [m for m in measured if m.transport == transport and m.clients == clients]
+
+    library = np.array([m.plans_per_second for m in turns(LIBRARY, MANY)])
+    for transport in dict.fromkeys(m.transport for m in measured if m.transport != LIBRARY):
+        added = median(np.array([m.p50_ms - (m.server_ms_p50 or 0) for m in turns(transport, FEW)]))
+        share = median(np.array([m.plans_per_second for m in turns(transport, MANY)]) / library)
         print(
-            f"{transport:20s} adds {one.p50_ms - (one.server_ms_p50 or 0):.2f} ms to a plan at {FEW} client, "
-            f"and with {MANY} has {many.plans_per_second / library:.0%} of the plans/s of the library alone",
+            f"{transport:20s} adds {added[0]:.2f} ms ({added[1]:.2f} to {added[2]:.2f}) to a plan at {FEW} client, and "
+            f"with {MANY} has {share[0]:.0%} ({share[1]:.0%} to {share[2]:.0%}) of the plans/s of the library alone "
+            f"(n = {len(library)})",
             flush=True,
         )
 
