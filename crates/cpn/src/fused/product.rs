@@ -44,8 +44,7 @@ pub enum Left<'a, T> {
 /// Sums in registers: of R rows, at P panels.
 type Sums<S, T, const R: usize, const P: usize> = [[[Lanes<S, T>; REGISTERS]; P]; R];
 
-/// Places along the inner dimension, each with b's numbers there, from a panel's row on, for P panels: first those of whole
-/// rows, then those where b may end within a register.
+/// A place along the inner dimension, with b's numbers there from each of P panels on.
 type Place<'a, T, const P: usize> = (usize, [&'a [T]; P]);
 
 impl<T: Real> Product<'_, T> {
@@ -76,7 +75,8 @@ impl<T: Real> Product<'_, T> {
     }
 
     /// Of R rows of c, at P panels, the part that some places along the inner dimension give: as the first, or added to what
-    /// is there. `room` is for what juts out over c's right edge.
+    /// is there. The places are those of whole rows of b, and those where it may end within a register. `room` is for what juts
+    /// out over c's right edge.
     #[inline(always)]
     fn tile<'a, S: Simd, const R: usize, const P: usize>(
         &mut self,
@@ -196,20 +196,21 @@ impl<T: Real> Row<'_, '_, T> {
         let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
         let mut panel = 0;
         while panel + 4 <= panels {
-            self.some::<S, 4>(simd, panel, first, places.clone(), room);
+            self.several::<S, 4>(simd, panel, first, places.clone(), room);
             panel += 4;
         }
         while panel + 2 <= panels {
-            self.some::<S, 2>(simd, panel, first, places.clone(), room);
+            self.several::<S, 2>(simd, panel, first, places.clone(), room);
             panel += 2;
         }
         if panel < panels {
-            self.some::<S, 1>(simd, panel, first, places, room);
+            self.several::<S, 1>(simd, panel, first, places, room);
         }
     }
 
+    /// P panels, from this one on.
     #[inline(always)]
-    fn some<S: Simd, const P: usize>(
+    fn several<S: Simd, const P: usize>(
         &mut self,
         simd: S,
         panel: usize,
