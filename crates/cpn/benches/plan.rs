@@ -45,7 +45,7 @@ struct Args {
     batch: usize,
     #[arg(long, default_value_t = 1)]
     threads: usize,
-    /// Encode in bfloat16, where the processor multiplies it.
+    /// Encode in bfloat16, where the processor has tiles for it.
     #[arg(long)]
     bfloat16: bool,
     /// What `cargo bench` says.
@@ -103,7 +103,7 @@ fn plan(path: &PathBuf, &Args { batch, threads, bfloat16, .. }: &Args) {
     let weights = tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t)));
     let agent = Agent::new(config.clone(), SEED);
     checkpoint::copy_weights(&weights.collect(), &agent).unwrap();
-    let precision = if bfloat16 { Precision::Bfloat16.where_multiplied() } else { Precision::Float32 };
+    let precision = if bfloat16 { Precision::Bfloat16.where_faster() } else { Precision::Float32 };
     let mut planner = Planner::new(agent, precision, threads);
     let observed = |bytes| -> Vec<_> { <[u8]>::chunks_exact(bytes, images::BYTES).map(Observed::Image).collect() };
     let (frames, x_gs) = (observed(&frames), planner.encode(&observed(&goals)));

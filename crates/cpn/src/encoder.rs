@@ -12,25 +12,19 @@ use tch::{Kind, Tensor};
 pub enum Precision {
     /// As everywhere else.
     Float32,
-    /// Twice as fast where the processor multiplies it, and close; many times slower where it does not.
+    /// Where the processor has tiles for it, faster for many images at once, and close; elsewhere slower.
     Bfloat16,
 }
 
 impl Precision {
-    /// The same, or float32 where the processor does not multiply it.
-    pub fn where_multiplied(self) -> Self {
+    /// The same, or float32 where that is faster.
+    pub fn where_faster(self) -> Self {
+        // The tiles (AMX) cannot be asked for; the processors that have them are those that multiply float16.
         #[cfg(target_arch = "x86_64")]
-        let multiplied = is_x86_feature_detected!("avx512bf16");
-        #[cfg(target_arch = "aarch64")]
-        let multiplied = std::arch::is_aarch64_feature_detected!("bf16");
-        if multiplied { self } else { Self::Float32 }
-    }
-
-    fn kind(self) -> Kind {
-        match self {
-            Self::Float32 => Kind::Float,
-            Self::Bfloat16 => Kind::BFloat16,
-        }
+        let faster = is_x86_feature_detected!("avx512fp16");
+        #[cfg(not(target_arch = "x86_64"))]
+        let faster = false;
+        if faster { self } else { Self::Float32 }
     }
 }
 
@@ -74,11 +68,10 @@ impl Encoder {
         self.normalise(self.linear.forward(&self.body.features(input, self.kind())))
     }
 
-    /// The same for weights in float32, in the order of sums that the library is fastest with. In bfloat16 the convolutions and
-    /// the linear layer on images multiply; weights, sums and what comes after stay in float32. Positions are embedded as ever.
-    pub fn encode_fast(&self, input: &Tensor, precision: Precision) -> Tensor {
-        let Body::Image { convolutions } = &self.body else { return self.encode(input) };
-        let kind = precision.kind();
+    /// The same for images, where convolutions and the linear layer multiply in bfloat16; weights in float32, sums and what comes
+    /// after stay in it.
+    pub fn encode_in_bfloat16(&self, images: &Tensor) -> Tensor {
+        let Body::Image { convolutions } = &self.body else { panic!("an encoder of images") };
         let mut y = Tensor::new();
         for (i, Convolution { layer, stride }) in convolutions.iter().enumerate() {
             let bias = layer.bs.as_ref().expect("built with a bias");
@@ -86,20 +79,20 @@ impl Encoder {
                 // Whole numbers up to 255 are exact in bfloat16, so that the weights take on the scaling of the pixels:
                 // w (p / 255 - 1/2) + b = (w / 255) p + (b - Σw / 2).
                 let sums = layer.ws.sum_dim_intlist([1, 2, 3].as_slice(), false, None::<Kind>);
-                let (blocks, weight, stride) = in_blocks(input, kind, &(&layer.ws / 255.0), *stride);
+                let (blocks, weight, stride) = in_blocks(images, &(&layer.ws / 255.0), *stride);
                 y = blocks;
                 (weight, bias - sums / 2.0, stride)
             } else {
                 (layer.ws.shallow_clone(), bias.shallow_clone(), *stride)
             };
-            let weight = channels_last(&weight.to_kind(kind));
-            y = y.conv2d(&weight, Some(bias.to_kind(kind)), [stride; 2], [0, 0], [1, 1], 1).relu_();
+            let weight = channels_last(&weight.to_kind(Kind::BFloat16));
+            y = y.conv2d(&weight, Some(bias.to_kind(Kind::BFloat16)), [stride; 2], [0, 0], [1, 1], 1).relu_();
         }
         // The features lie with their channels last; the weights are turned rather than them.
         let (_, channels, size, _) = y.size4().expect("a batch of feature maps");
         let weight = self.linear.ws.view([-1, channels, size, size]).permute([0, 2, 3, 1]).flatten(1, -1);
         let features = y.permute([0, 2, 3, 1]).flatten(1, -1);
-        let x = features.matmul(&weight.to_kind(kind).tr()).to_kind(Kind::Float);
+        let x = features.matmul(&weight.to_kind(Kind::BFloat16).tr()).to_kind(Kind::Float);
         self.normalise(x + self.linear.bs.as_ref().expect("built with a bias"))
     }
 
@@ -116,18 +109,18 @@ impl Encoder {
     }
 }
 
-/// Images `[B, 84, 84, 3]` as numbers `[B, C, S, S]`, for a convolution with weights `[O, C, K, K]`, and its stride.
+/// Images `[B, 84, 84, 3]` as bfloat16 `[B, C, S, S]`, for a convolution with weights `[O, C, K, K]`, and its stride.
 ///
 /// With the stride of the paper's first convolution, and a kernel that its blocks cut evenly, these become channels: the
 /// same sums as a convolution of stride 1 with many channels, which the library computes far faster than one with three.
-fn in_blocks(images: &Tensor, kind: Kind, weight: &Tensor, stride: i64) -> (Tensor, Tensor, i64) {
+fn in_blocks(images: &Tensor, weight: &Tensor, stride: i64) -> (Tensor, Tensor, i64) {
     let (outputs, channels, kernel, _) = weight.size4().expect("the weight of a convolution");
     if stride != images::BLOCK || kernel % stride != 0 {
-        return (images.permute([0, 3, 1, 2]).to_kind(kind), weight.shallow_clone(), stride);
+        return (images.permute([0, 3, 1, 2]).to_kind(Kind::BFloat16), weight.shallow_clone(), stride);
     }
     let (count, side) = (kernel / stride, images::SIZE / stride);
     let weight = weight.view([outputs, channels, count, stride, count, stride]).permute([0, 3, 5, 1, 2, 4]);
-    let blocks = images::blocks(images, kind).view([-1, side, side, stride * stride * channels]);
+    let blocks = images::blocks_in_bfloat16(images).view([-1, side, side, stride * stride * channels]);
     (blocks.permute([0, 3, 1, 2]), weight.reshape([outputs, -1, count, count]), 1)
 }
 

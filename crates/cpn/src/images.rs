@@ -23,34 +23,25 @@ pub fn from_bytes(data: &[u8]) -> Result<Tensor, ImageError> {
     Ok(Tensor::from_data_size(data, &shape, Kind::Uint8))
 }
 
-/// Images `[B, 84, 84, 3]` as numbers, float32 or bfloat16, cut into blocks of [`BLOCK`] x [`BLOCK`] pixels that lie one after
-/// the other: `[B, 21, 21, 4, 4, 3]`.
-pub fn blocks(images: &Tensor, kind: Kind) -> Tensor {
-    let mut bytes = vec![0; images.numel()];
-    images.copy_data_u8(&mut bytes, images.numel());
-    let shape = [images.size()[0], SIZE / BLOCK, SIZE / BLOCK, BLOCK, BLOCK, CHANNELS];
-    if kind == Kind::BFloat16 {
-        // 8 bits fit a bfloat16, which is the upper half of a float32.
-        let blocks = cut(&bytes, |value| (f32::from(value).to_bits() >> 16) as u16);
-        Tensor::from_data_size(bytemuck::cast_slice::<u16, u8>(&blocks), &shape, kind)
-    } else {
-        Tensor::from_slice(&cut(&bytes, f32::from)).view(shape).to_kind(kind)
-    }
-}
-
-fn cut<T>(bytes: &[u8], number: impl Fn(u8) -> T) -> Vec<T> {
+/// Images `[B, 84, 84, 3]` as bfloat16, cut into blocks of [`BLOCK`] x [`BLOCK`] pixels that lie one after the other:
+/// `[B, 21, 21, 4, 4, 3]`.
+pub fn blocks_in_bfloat16(images: &Tensor) -> Tensor {
     const RUN: usize = (BLOCK * CHANNELS) as usize;
     let (side, size) = ((SIZE / BLOCK) as usize, BLOCK as usize);
-    let mut blocks = Vec::with_capacity(bytes.len());
+    let mut bytes = vec![0; images.numel()];
+    images.copy_data_u8(&mut bytes, images.numel());
+    let mut blocks: Vec<u16> = Vec::with_capacity(bytes.len());
     // A band of four rows of pixels holds a row of blocks.
     for band in bytes.as_chunks::<RUN>().0.chunks_exact(side * size) {
         for block in 0..side {
             for row in 0..size {
-                blocks.extend(band[row * side + block].map(&number));
+                // 8 bits fit a bfloat16, which is the upper half of a float32.
+                blocks.extend(band[row * side + block].map(|value| (f32::from(value).to_bits() >> 16) as u16));
             }
         }
     }
-    blocks
+    let shape = [images.size()[0], SIZE / BLOCK, SIZE / BLOCK, BLOCK, BLOCK, CHANNELS];
+    Tensor::from_data_size(bytemuck::cast_slice::<u16, u8>(&blocks), &shape, Kind::BFloat16)
 }
 
 /// Image data of the wrong length.

@@ -25,6 +25,7 @@ pub mod archive;
 pub mod checkpoint;
 pub mod config;
 pub mod dynamics;
+mod embeddings;
 pub mod encoder;
 pub mod fused;
 pub mod images;

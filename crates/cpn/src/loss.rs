@@ -1,6 +1,7 @@
 //! The outer loop: behaviour cloning of the planned actions, through the inner loop.
 
 use crate::agent::Agent;
+use crate::embeddings::FrameEncoder;
 use crate::encoder::Precision;
 use crate::fused::{self, OuterLoop, Samples, Variables, floats};
 use std::collections::BTreeMap;
@@ -41,48 +42,45 @@ pub struct Gradient {
     pub encoder_seconds: f64,
 }
 
-/// Differentiates outer losses fast: the encoder by autograd, everything past it by hand ([`crate::fused`]).
+/// Differentiates outer losses without a graph ([`crate::fused`]).
 #[derive(Debug)]
 pub struct OuterLoss {
+    frames: FrameEncoder,
     fused: OuterLoop<f32>,
-    precision: Precision,
 }
 
 impl OuterLoss {
     /// For agents like this one, in float32, on some threads.
     pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
-        Self { fused: OuterLoop::new(agent.config().clone(), threads), precision }
+        Self {
+            frames: FrameEncoder::new(agent.config(), precision, threads),
+            fused: OuterLoop::new(agent.config().clone(), threads),
+        }
     }
 
     /// The outer loss of a batch and its gradient, by the name of each weight that takes part; agrees with what autograd
     /// makes of [`Agent::outer_loss`].
     pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
         let started = Instant::now();
-        let embeddings = agent.encoder().encode_fast(&batch.frames, self.precision);
-        let values = floats(&embeddings.detach());
+        let (embeddings, way_back) = self.frames.embed(agent, &batch.frames);
         let encoding = started.elapsed();
-        let latent = embeddings.size()[1] as usize;
+        let latent = agent.config().encoder.latent() as usize;
         let rows = |indices: &Tensor| floats::<i64>(indices).into_iter().map(|row| row as usize * latent);
-        let gather = |indices| rows(indices).flat_map(|at| &values[at..at + latent]).copied().collect::<Vec<f32>>();
+        let gather = |indices| rows(indices).flat_map(|at| &embeddings[at..at + latent]).copied().collect::<Vec<f32>>();
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
         let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
         let variables = agent.variables().variables();
         let samples = Samples { x: &x, x_g: &x_g, actions: &actions, mask: &mask };
         let outer = self.fused.run(&Variables(&variables), samples);
 
-        let mut hat = vec![0.0; values.len()];
+        let mut hat = vec![0.0; embeddings.len()];
         for (indices, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
             for (at, gradient) in rows(indices).zip(gradient.chunks_exact(latent)) {
                 fused::add(&mut hat[at..at + latent], gradient);
             }
         }
         let started = Instant::now();
-        // Autograd is told the gradient in the embeddings by a sum that has it.
-        let sum = (&embeddings * Tensor::from_slice(&hat).view_as(&embeddings)).sum(None::<Kind>);
-        let (names, weights): (Vec<_>, Vec<_>) =
-            variables.iter().filter(|(name, _)| name.starts_with("encoder.")).unzip();
-        let in_encoder = Tensor::run_backward(&[sum], &weights, false, false);
-        let in_encoder = names.into_iter().cloned().zip(in_encoder.iter().map(floats));
+        let in_encoder = way_back.adjoint(agent, &hat);
         Gradient {
             loss: outer.loss.into(),
             weights: outer.weights.into_iter().chain(in_encoder).collect(),

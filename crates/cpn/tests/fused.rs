@@ -4,9 +4,12 @@
 
 mod common;
 
-use common::{small_config, uniform};
-use cpn::fused::{OuterLoop, Samples, Weights};
-use cpn::{MethodKind, ModelConfig, loss};
+use common::{double_agent, encoders, noise_images, position_config, small_config, uniform};
+use cpn::config::ConvConfig;
+use cpn::fused::{Embedder, OuterLoop, Samples, Weights};
+use cpn::method::Observed;
+use cpn::{EncoderConfig, Input, MethodKind, ModelConfig, images, loss, positions};
+use proptest::prelude::*;
 use std::collections::HashMap;
 use tch::{Kind, Tensor};
 
@@ -23,7 +26,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
 }
 
 fn check(config: ModelConfig, rows: i64, threads: usize) {
-    let agent = common::double_agent(config.clone());
+    let agent = double_agent(config.clone());
     let latent = config.encoder.latent();
     let scale = 2.0;
     let x = (uniform(&[rows, latent], 1) * scale).set_requires_grad(true);
@@ -41,14 +44,7 @@ fn check(config: ModelConfig, rows: i64, threads: usize) {
     let ours = OuterLoop::new(config.clone(), threads).run(&variables, samples);
     let Named(variables) = variables;
 
-    let close = |name: &str, ours: &[f64], reference: &Tensor| {
-        let reference = floats(reference);
-        assert_eq!(ours.len(), reference.len(), "{name}");
-        let largest = reference.iter().fold(0.0f64, |m, r| m.max(r.abs()));
-        for (o, r) in ours.iter().zip(&reference) {
-            assert!((o - r).abs() < 1e-10 * (1.0 + largest), "{config:?} {name}: {o} for {r}");
-        }
-    };
+    let close = |name: &str, ours: &[f64], reference: &Tensor| assert_close(&config, name, ours, reference);
     close("loss", &[ours.loss], &reference);
     close("x", &ours.x, &gradient(&x));
     close("x_g", &ours.x_g, &gradient(&x_g));
@@ -59,6 +55,15 @@ fn check(config: ModelConfig, rows: i64, threads: usize) {
     }
     let by_autograd = variables.values().filter(|v| gradient(v).abs().max().double_value(&[]) > 0.0).count();
     assert_eq!(learnt, by_autograd, "{config:?}: every weight that autograd moves must be there");
+}
+
+fn assert_close(config: &ModelConfig, name: &str, ours: &[f64], reference: &Tensor) {
+    let reference = floats(reference);
+    assert_eq!(ours.len(), reference.len(), "{name}");
+    let largest = reference.iter().fold(0.0f64, |m, r| m.max(r.abs()));
+    for (o, r) in ours.iter().zip(&reference) {
+        assert!((o - r).abs() < 1e-10 * (1.0 + largest), "{config:?} {name}: {o} for {r}");
+    }
 }
 
 /// What autograd left; zeros if nothing.
@@ -85,4 +90,64 @@ fn agrees_with_autograd() {
 #[test]
 fn gates_in_parts_agree_with_autograd() {
     check(ModelConfig { horizon: 2, hidden: 33, ..ModelConfig::paper(MethodKind::Cpn) }, 20, 1);
+}
+
+/// Embeddings, and the gradient of a loss that is linear in them.
+fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
+    let agent = double_agent(config.clone());
+    let (bytes, metres): (Vec<u8>, Vec<[f32; 3]>);
+    let (frames, tensor): (Vec<_>, _) = match config.encoder.input() {
+        Input::Image => {
+            let images = noise_images(rows as i64, 5);
+            bytes = Vec::try_from(images.flatten(0, -1)).unwrap();
+            (bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(), images)
+        }
+        Input::Position => {
+            metres = (0..rows).map(|row| [row as f32 / 8.0, 0.3, -0.6]).collect();
+            (metres.iter().copied().map(Observed::Position).collect(), positions::from_metres(&metres))
+        }
+    };
+    let reference = agent.encoder().encode(&tensor);
+    let hat = uniform(&reference.size(), 6);
+    (&reference * &hat).sum(None::<Kind>).backward();
+
+    let variables = Named(agent.variables().variables());
+    let mut embedder = Embedder::<f64>::new(config.encoder.clone(), threads);
+    // Again, from what the passes before left.
+    for _ in 0..2 {
+        let (embeddings, embedded) = embedder.forward(&variables, &frames);
+        assert_close(config, "embeddings", &embeddings, &reference);
+        let weights = embedded.adjoint(&floats(&hat));
+        for (name, ours) in &weights {
+            assert_close(config, name, ours, &gradient(&variables.0[name]));
+        }
+        let expected = variables.0.keys().filter(|name| name.starts_with("encoder.")).count();
+        assert_eq!(weights.len(), expected, "{config:?}: every weight of the encoder must be there");
+    }
+}
+
+#[test]
+fn encoders_agree_with_autograd() {
+    let mut large = small_config(MethodKind::Bc);
+    if let EncoderConfig::Image(encoder) = &mut large.encoder {
+        // So many tiles in an image of the second that they are multiplied in several parts.
+        let convolutions = [(5, 7, 2), (16, 4, 2)];
+        encoder.convolutions =
+            convolutions.map(|(channels, kernel, stride)| ConvConfig { channels, kernel, stride }).into();
+    }
+    let paper = ModelConfig::paper(MethodKind::Bc);
+    for config in [small_config(MethodKind::Bc), position_config(MethodKind::Bc), large, paper] {
+        for (rows, threads) in [(1, 1), (11, 1), (11, 2)] {
+            check_encoder(&config, rows, threads);
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn encoders_of_all_shapes_agree_with_autograd(encoder in encoders(), rows in 1usize..8) {
+        check_encoder(&ModelConfig { encoder: EncoderConfig::Image(encoder), ..small_config(MethodKind::Bc) }, rows, 1);
+    }
 }

@@ -4,8 +4,7 @@
 
 mod common;
 
-use common::{double_agent, noise_images, position_config, small_config, uniform};
-use cpn::config::{ConvConfig, ImageEncoderConfig};
+use common::{double_agent, encoders, noise_images, position_config, small_config, uniform};
 use cpn::encoder::Precision;
 use cpn::images;
 use cpn::inner_loop::TensorPlan;
@@ -130,23 +129,6 @@ proptest! {
             assert_eq!(plan.iterations, updates);
         }
     }
-}
-
-/// Features of the largest of these encoders; over more, float32's linear layer alone rounds by more than [`TOLERANCE`].
-const FEATURES: i64 = 8192;
-
-/// Encoders of one or two convolutions: kernels of one to four strides, or of a pixel more; images that end with a tile, or not.
-fn encoders() -> impl Strategy<Value = ImageEncoderConfig> {
-    let taps = (1i64..5, 1i64..5, 0i64..2).prop_map(|(taps, stride, more)| (taps * stride + more, stride));
-    let convolution = (prop_oneof![Just(16i64), Just(32), Just(5)], taps)
-        .prop_filter("a valid kernel", |(_, (kernel, _))| *kernel <= 8)
-        .prop_map(|(channels, (kernel, stride))| ConvConfig { channels, kernel, stride });
-    proptest::collection::vec(convolution, 1..3)
-        .prop_map(|convolutions| ImageEncoderConfig { convolutions, latent: 6, layer_norm: true })
-        .prop_filter("few enough features", |encoder| {
-            let side = encoder.convolutions.iter().fold(images::SIZE, |side, c| (side - c.kernel) / c.stride + 1);
-            side * side * encoder.convolutions[encoder.convolutions.len() - 1].channels <= FEATURES
-        })
 }
 
 proptest! {

@@ -17,7 +17,8 @@ pub struct SessionConfig {
     #[arg(long, env = "CPN_LISTEN", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
-    /// Passes large payloads to processes on the same machine by shared memory.
+    /// Passes large payloads to processes on the same machine by shared memory; for sessions that stay, since zenoh keeps what
+    /// ended ones shared.
     #[arg(long, env = "CPN_SHARED_MEMORY")]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub shared_memory: bool,

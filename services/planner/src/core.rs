@@ -39,9 +39,11 @@ impl PlannerCore {
     /// # Errors
     /// Names the first checkpoint that cannot be loaded, and why.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
-        let computing = Computing { precision: config.precision.where_multiplied(), threads: config.threads };
+        let computing = Computing { precision: config.precision.where_faster(), threads: config.threads };
         if computing.precision != config.precision {
-            warn!("precision: expected a processor that multiplies bfloat16; embedding in float32");
+            warn!(
+                "precision: expected a processor with tiles for bfloat16 (AMX); embedding in float32, which is faster here"
+            );
         }
         let folder = config.models_dir.clone();
         let models = tokio::task::spawn_blocking(move || load_all(&folder, computing)).await??;

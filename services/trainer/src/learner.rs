@@ -46,7 +46,7 @@ impl Learner {
         let agent = Agent::new(recipe.model.clone(), seed);
         Self {
             optimiser: Adam::new(agent.variables()),
-            outer_loss: OuterLoss::new(&agent, recipe.training.precision.where_multiplied(), threads),
+            outer_loss: OuterLoss::new(&agent, recipe.training.precision.where_faster(), threads),
             agent,
             max_gradient_norm: recipe.training.max_gradient_norm,
         }

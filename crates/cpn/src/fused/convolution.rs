@@ -2,8 +2,7 @@
 
 use super::gate::rectify;
 use super::lanes::{Aligned, grown, zeros};
-use super::matrix::Panels;
-use super::product::{Left, multiply};
+use super::linear::{Linear, LinearGradient};
 use super::real::Real;
 use super::winograd::{self, Winograd};
 
@@ -23,17 +22,17 @@ enum Way<T> {
     Patches(Patches<T>),
 }
 
-/// A product with copies of what the kernel sees, for kernels that tiles do not suit.
+/// A linear layer of copies of what the kernel sees, for kernels that tiles do not suit.
 #[derive(Debug)]
 struct Patches<T> {
     /// Where each of them begins, `[S' S']`.
     starts: Vec<usize>,
     /// Where its numbers lie from there on, `[K K C]`.
     places: Vec<usize>,
-    /// `[K K C, O]`.
-    weight: Panels<T>,
-    /// `[O]`.
-    bias: Vec<T>,
+    /// C.
+    channels: usize,
+    /// From K K C to O.
+    linear: Linear<T>,
 }
 
 /// Room for what lies between images and outputs, kept from layer to layer.
@@ -60,14 +59,53 @@ impl<T: Real> Convolution<T> {
         Self { way, inputs: side * side * channels, outputs: size * size * bias.len() }
     }
 
-    /// Images `[R, S, S, C]`, with [`winograd::BEYOND`] numbers behind them, to `[R, S', S', O]`.
+    /// Images `[R, S, S, C]`, with [`BEYOND`](super::tiles::BEYOND) numbers behind them, to `[R, S', S', O]`.
     pub fn forward(&self, x: &[T], y: &mut [T], room: &mut Room<T>) {
         match &self.way {
             Way::Tiles(tiles) => tiles.forward(x, y, &mut room.tiles),
             Way::Patches(patches) => {
                 for (x, y) in x.chunks_exact(self.inputs).zip(y.chunks_exact_mut(self.outputs)) {
-                    patches.forward(x, y, &mut room.patches);
+                    patches.linear.forward(patches.copied(x, &mut room.patches), y);
+                    rectify(y);
                 }
+            }
+        }
+    }
+
+    /// Adds to the gradient what ŷ gives, from behind the unit, and writes x̂ if it is asked for.
+    pub fn adjoint(
+        &self,
+        (x, y_hat): (&[T], &[T]),
+        mut x_hat: Option<&mut [T]>,
+        gradient: &mut [LinearGradient<T>],
+        room: &mut Room<T>,
+    ) {
+        match &self.way {
+            Way::Tiles(tiles) => tiles.adjoint((x, y_hat), x_hat, gradient, &mut room.tiles),
+            Way::Patches(patches) => {
+                for (i, (x, y_hat)) in x.chunks_exact(self.inputs).zip(y_hat.chunks_exact(self.outputs)).enumerate() {
+                    let x_hat = x_hat.as_mut().map(|x_hat| &mut x_hat[i * self.inputs..][..self.inputs]);
+                    patches.adjoint((x, y_hat), x_hat, &mut gradient[0], &mut room.patches);
+                }
+            }
+        }
+    }
+
+    /// A gradient of zeros, in the layers that the convolution is made of.
+    pub fn gradient(&self) -> Vec<LinearGradient<T>> {
+        match &self.way {
+            Way::Tiles(tiles) => tiles.gradient(),
+            Way::Patches(patches) => vec![patches.linear.gradient()],
+        }
+    }
+
+    /// A gradient as one in `[O, C, K, K]`, and in `[O]`.
+    pub fn in_weights(&self, gradient: &[LinearGradient<T>]) -> [Vec<T>; 2] {
+        match &self.way {
+            Way::Tiles(tiles) => tiles.in_weights(gradient),
+            Way::Patches(Patches { places, channels, .. }) => {
+                let LinearGradient { weight, bias } = &gradient[0];
+                [turn(weight, places.len() / channels, *channels), bias.to_vec()]
             }
         }
     }
@@ -81,29 +119,48 @@ impl<T: Real> Patches<T> {
         Self {
             starts: starts.collect(),
             places: places.collect(),
-            weight: Panels::transposed(&turn(weight, channels, kernel * kernel), kernel * kernel * channels),
-            bias: bias.to_vec(),
+            channels,
+            linear: Linear::new(turn(weight, channels, kernel * kernel), bias.to_vec()),
         }
     }
 
-    /// An image `[S, S, C]` to `[S', S', O]`.
-    fn forward(&self, x: &[T], y: &mut [T], patches: &mut Aligned<T>) {
-        let Self { starts, places, weight, bias } = self;
+    /// What the kernel sees of an image `[S, S, C]`.
+    fn copied<'a>(&self, x: &[T], patches: &'a mut Aligned<T>) -> &'a mut [T] {
+        let Self { starts, places, .. } = self;
         let patches = grown(patches, starts.len() * places.len());
         for (patch, start) in patches.chunks_exact_mut(places.len()).zip(starts) {
             patch.iter_mut().zip(places).for_each(|(number, place)| *number = x[start + place]);
         }
-        y.chunks_exact_mut(bias.len()).for_each(|y| y.copy_from_slice(bias));
-        multiply(true, y, Left::Rows(patches), weight.matrix(0..bias.len()));
-        rectify(y);
+        patches
+    }
+
+    fn adjoint(
+        &self,
+        (x, y_hat): (&[T], &[T]),
+        x_hat: Option<&mut [T]>,
+        gradient: &mut LinearGradient<T>,
+        patches: &mut Aligned<T>,
+    ) {
+        let Self { starts, places, linear, .. } = self;
+        let patches = self.copied(x, patches);
+        linear.accumulate(linear.all(), starts.len(), (patches, y_hat), gradient);
+        let Some(x_hat) = x_hat else { return };
+        patches.fill(T::ZERO);
+        linear.backward(linear.all(), y_hat, patches);
+        x_hat.fill(T::ZERO);
+        for (patch, start) in patches.chunks_exact(places.len()).zip(starts) {
+            patch.iter().zip(places).for_each(|(number, place)| x_hat[start + place] += *number);
+        }
     }
 }
 
 /// Rows `[C, P]`, one after the other, as rows `[P, C]`.
 pub fn turn<T: Real>(rows: &[T], channels: usize, positions: usize) -> Vec<T> {
-    let row = |row: &[T]| {
-        let at = (0..positions).flat_map(|p| (0..channels).map(move |c| c * positions + p));
-        at.map(|at| row[at]).collect::<Vec<_>>()
-    };
-    rows.chunks_exact(channels * positions).flat_map(row).collect()
+    let mut turned = Vec::with_capacity(rows.len());
+    for row in rows.chunks_exact(channels * positions) {
+        for p in 0..positions {
+            turned.extend((0..channels).map(|c| row[c * positions + p]));
+        }
+    }
+    turned
 }

@@ -54,7 +54,7 @@ impl<T: Real> Tape<T> {
     }
 }
 
-impl<T> DenseGradient<T> {
+impl<T: Real> DenseGradient<T> {
     /// Every tensor, by its name in a checkpoint.
     pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
         let mut tensors = self.linear.tensors(name);

@@ -1,149 +1,311 @@
-//! The encoder f_φ for planning.
+//! The encoder f_φ.
 
 use super::convolution::{self, Convolution, turn};
-use super::gate::rectify;
+use super::gate::{mask, rectify};
 use super::lanes::{Aligned, grown, zeros};
-use super::linear::{Linear, Weights};
+use super::linear::{Linear, LinearGradient, Weights};
+use super::norm::Norm;
 use super::real::Real;
-use super::winograd::BEYOND;
+use super::tiles::BEYOND;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::images::{BYTES, CHANNELS, SIZE};
 use crate::method::Observed;
 use pulp::{Arch, Simd, WithSimd};
+use std::mem::swap;
 
-/// What layer normalisation adds to the variance, as libtorch does.
-const EPSILON: f64 = 1e-5;
 /// Inputs that go through the layers at once: with more of them weights are read less often, with fewer what a layer leaves lies
 /// nearer.
-const INPUTS: usize = 4;
+pub const INPUTS: usize = 4;
 
-/// What suits the input, then a linear layer to the embedding.
+/// Layers that suit the input, then a linear layer to the embedding.
 #[derive(Debug)]
 pub struct Encoder<T> {
-    body: Body<T>,
+    numbers: Numbers<T>,
+    layers: Vec<Layer<T>>,
+    /// Of the features, whose order is positions first in the checkpoint, and last here: the weights are turned rather than them.
+    channels: usize,
     linear: Linear<T>,
     norm: Option<Norm<T>>,
 }
 
-/// From the input to features.
+/// What becomes of an input.
 #[derive(Debug)]
-enum Body<T> {
-    Image { convolutions: Vec<Convolution<T>> },
-    Position { centre_metres: [f64; 3], scale_metres: T, layers: Vec<Linear<T>> },
+enum Numbers<T> {
+    Pixels,
+    Position { centre_metres: [f64; 3], scale_metres: T },
 }
 
-/// Layer normalisation, `[Z]`.
+/// A layer, and the rectified linear unit behind it.
 #[derive(Debug)]
-struct Norm<T> {
-    weight: Vec<T>,
-    bias: Vec<T>,
+enum Layer<T> {
+    Convolution(Convolution<T>),
+    Linear(Linear<T>),
 }
 
-/// Room for the passes, kept from input to input.
+/// What an outer loss changes by when the weights do.
 #[derive(Debug)]
-pub struct Room<T> {
-    /// What a layer takes, with some numbers behind it.
-    x: Aligned<T>,
-    /// What it gives.
-    y: Aligned<T>,
-    convolution: convolution::Room<T>,
-    /// Of all inputs, `[R, F]`.
+pub struct EncoderGradient<T> {
+    layers: Vec<Vec<LinearGradient<T>>>,
+    linear: LinearGradient<T>,
+    norm: Option<LinearGradient<T>>,
+}
+
+/// What the forward pass over inputs leaves.
+#[derive(Debug)]
+pub struct Tape<T> {
+    /// For every [`INPUTS`] of them what each layer takes, with [`BEYOND`] numbers behind it.
+    groups: Vec<Vec<Aligned<T>>>,
+    /// `[R, F]`.
     features: Aligned<T>,
+    /// What is normalised, `[R, Z]`.
+    x: Vec<T>,
+    /// Room for the passes.
+    convolution: convolution::Room<T>,
+    features_hat: Aligned<T>,
+    /// x̂ of a layer, and of the one behind it.
+    x_hat: Aligned<T>,
+    y_hat: Aligned<T>,
 }
 
-impl<T: Real> Room<T> {
+impl<T: Real> Tape<T> {
     /// Empty.
     pub fn new() -> Self {
-        Self { x: zeros(0), y: zeros(0), convolution: convolution::Room::new(), features: zeros(0) }
+        Self {
+            groups: Vec::new(),
+            features: zeros(0),
+            x: Vec::new(),
+            convolution: convolution::Room::new(),
+            features_hat: zeros(0),
+            x_hat: zeros(0),
+            y_hat: zeros(0),
+        }
     }
 }
 
 impl<T: Real> Encoder<T> {
     /// Reads the weights of a valid configuration.
     pub fn new(config: &EncoderConfig, weights: &impl Weights<T>) -> Self {
+        let (numbers, layers, channels) = match config {
+            EncoderConfig::Image(config) => of_images(config, weights),
+            EncoderConfig::Position(config) => of_positions(config, weights),
+        };
         let linear = Linear::named("encoder.linear", weights);
-        let [weight, bias] = ["weight", "bias"].map(|part| format!("encoder.norm.{part}"));
-        let norm = config.layer_norm().then(|| Norm { weight: weights.get(&weight), bias: weights.get(&bias) });
-        match config {
-            EncoderConfig::Image(config) => {
-                let (body, channels) = Body::image(config, weights);
-                // The features lie with their channels last; the weights are turned rather than them.
-                let positions = linear.inputs / channels;
-                let turned = turn(linear.weight(), channels, positions);
-                Self { body, linear: Linear::new(turned, linear.bias().to_vec()), norm }
-            }
-            EncoderConfig::Position(config) => Self { body: Body::position(config, weights), linear, norm },
+        let turned = turn(linear.weight(), channels, linear.inputs / channels);
+        let linear = Linear::new(turned, linear.bias().to_vec());
+        let norm = config.layer_norm().then(|| Norm::named("encoder.norm", weights));
+        Self { numbers, layers, channels, linear, norm }
+    }
+
+    /// Z.
+    pub fn latent(&self) -> usize {
+        self.linear.outputs
+    }
+
+    /// Embeds images of 84 x 84 or positions, whichever it takes, `[R, Z]`. What is embedded `for_adjoint` leaves a whole tape.
+    pub fn forward(&self, inputs: &[Observed<'_>], for_adjoint: bool, tape: &mut Tape<T>) -> Vec<T> {
+        let count = if for_adjoint { inputs.len().div_ceil(INPUTS) } else { 1 };
+        if tape.groups.len() < count {
+            tape.groups.resize_with(count, || vec![zeros(0); self.layers.len()]);
+        }
+        let features = grown(&mut tape.features, inputs.len() * self.linear.inputs);
+        let groups = inputs.chunks(INPUTS).zip(features.chunks_mut(INPUTS * self.linear.inputs));
+        for (i, (inputs, features)) in groups.enumerate() {
+            self.features(inputs, features, &mut tape.groups[i % count], &mut tape.convolution);
+        }
+        tape.x.resize(inputs.len() * self.latent(), T::ZERO);
+        self.linear.forward(features, &mut tape.x);
+        match &self.norm {
+            Some(norm) => norm.forward(&tape.x),
+            None => tape.x.clone(),
         }
     }
 
-    /// Embeds images of 84 x 84 or positions, whichever it takes, as `[Z]` each.
-    pub fn encode(&self, inputs: &[Observed<'_>], room: &mut Room<T>) -> Vec<Vec<T>> {
-        room.features.clear();
-        for inputs in inputs.chunks(INPUTS) {
-            self.body.features(inputs, room);
-            room.features.extend_from_slice(&room.x[..inputs.len() * self.linear.inputs]);
+    /// After a [`Self::forward`] for it: adds to the gradient what x̂ gives, `[R, Z]`.
+    pub fn adjoint(&self, mut x_hat: Vec<T>, gradient: &mut EncoderGradient<T>, tape: &mut Tape<T>) {
+        let rows = x_hat.len() / self.latent();
+        if let (Some(norm), Some(gradient)) = (&self.norm, &mut gradient.norm) {
+            norm.adjoint(&tape.x, &mut x_hat, gradient);
         }
-        let mut embeddings = vec![T::ZERO; inputs.len() * self.linear.outputs];
-        self.linear.forward(&room.features, &mut embeddings);
-        if let Some(norm) = &self.norm {
-            embeddings.chunks_exact_mut(self.linear.outputs).for_each(|embedding| norm.apply(embedding));
+        let group = INPUTS * self.linear.inputs;
+        let features = &tape.features[..rows * self.linear.inputs];
+        let features_hat = grown(&mut tape.features_hat, features.len());
+        features_hat.fill(T::ZERO);
+        self.linear.accumulate(self.linear.all(), rows, (features, &x_hat), &mut gradient.linear);
+        self.linear.backward(self.linear.all(), &x_hat, features_hat);
+        for (xs, (mut y, y_hat)) in tape.groups.iter().zip(features.chunks(group).zip(features_hat.chunks(group))) {
+            let inputs = y.len() / self.linear.inputs;
+            grown(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
+            let layers = self.layers.iter().zip(xs).zip(&mut gradient.layers);
+            for (l, ((layer, x), gradient)) in layers.enumerate().rev() {
+                let y_hat = &mut tape.y_hat[..y.len()];
+                mask(y_hat, y);
+                let x_hat = (l > 0).then(|| grown(&mut tape.x_hat, inputs * layer.inputs()));
+                layer.adjoint((inputs, x, y_hat), x_hat, gradient, &mut tape.convolution);
+                swap(&mut tape.x_hat, &mut tape.y_hat);
+                y = &x[..inputs * layer.inputs()];
+            }
         }
-        embeddings.chunks_exact(self.linear.outputs).map(<[T]>::to_vec).collect()
+    }
+
+    /// A gradient of zeros.
+    pub fn gradient(&self) -> EncoderGradient<T> {
+        EncoderGradient {
+            layers: self.layers.iter().map(Layer::gradient).collect(),
+            linear: self.linear.gradient(),
+            norm: self.norm.as_ref().map(Norm::gradient),
+        }
+    }
+
+    /// A gradient by the names of the weights.
+    pub fn in_weights(&self, gradient: &EncoderGradient<T>) -> Vec<(String, Vec<T>)> {
+        let mut weights = Vec::new();
+        let mut add = |name: String, [weight, bias]: [Vec<T>; 2]| {
+            weights.push((format!("encoder.{name}.weight"), weight));
+            weights.push((format!("encoder.{name}.bias"), bias));
+        };
+        for (i, (layer, gradient)) in self.layers.iter().zip(&gradient.layers).enumerate() {
+            match layer {
+                Layer::Convolution(convolution) => add(format!("conv.{i}"), convolution.in_weights(gradient)),
+                Layer::Linear(_) => add(format!("layer.{i}"), [gradient[0].weight.to_vec(), gradient[0].bias.to_vec()]),
+            }
+        }
+        let LinearGradient { weight, bias } = &gradient.linear;
+        add("linear".to_owned(), [turn(weight, self.linear.inputs / self.channels, self.channels), bias.to_vec()]);
+        if let Some(LinearGradient { weight, bias }) = &gradient.norm {
+            add("norm".to_owned(), [weight.to_vec(), bias.to_vec()]);
+        }
+        weights
+    }
+
+    /// Through the layers, to `[R, F]`.
+    fn features(
+        &self,
+        inputs: &[Observed<'_>],
+        features: &mut [T],
+        tape: &mut [Aligned<T>],
+        room: &mut convolution::Room<T>,
+    ) {
+        let mut rest = tape;
+        for (l, layer) in self.layers.iter().enumerate() {
+            let Some((x, others)) = rest.split_first_mut() else { break };
+            let x = grown(x, inputs.len() * layer.inputs() + BEYOND);
+            if l == 0 {
+                self.numbers.write(inputs, x);
+            }
+            let size = inputs.len() * layer.outputs();
+            match others.first_mut() {
+                Some(y) => layer.forward(inputs.len(), x, &mut grown(y, size + BEYOND)[..size], room),
+                None => layer.forward(inputs.len(), x, features, room),
+            }
+            rest = others;
+        }
     }
 }
 
-impl<T: Real> Body<T> {
-    /// The convolutions, and the channels of the last one.
-    fn image(config: &ImageEncoderConfig, weights: &impl Weights<T>) -> (Self, usize) {
-        let (mut side, mut channels) = (SIZE as usize, CHANNELS as usize);
-        let mut convolutions = Vec::new();
-        for (i, conv) in config.convolutions.iter().enumerate() {
-            let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
-            let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
-            convolutions.push(Convolution::new((side, channels), (kernel, stride), &weight, &bias));
-            (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
-        }
-        (Self::Image { convolutions }, channels)
+impl<T: Real> EncoderGradient<T> {
+    /// Adds that of other inputs.
+    pub fn add(&mut self, other: &Self) {
+        let ours = self.layers.iter_mut().flatten().chain([&mut self.linear]).chain(&mut self.norm);
+        let others = other.layers.iter().flatten().chain([&other.linear]).chain(&other.norm);
+        ours.zip(others).for_each(|(ours, other)| ours.add(other));
     }
+}
 
-    fn position(config: &PositionEncoderConfig, weights: &impl Weights<T>) -> Self {
-        let layer = |i| Linear::named(&format!("encoder.layer.{i}"), weights);
-        Self::Position {
-            centre_metres: config.centre_mm.map(|mm| mm as f64 / 1e3),
-            scale_metres: T::from_f64(config.scale_mm as f64 / 1e3),
-            layers: (0..config.layers.len()).map(layer).collect(),
-        }
+/// The convolutions, with the channels of the last one.
+fn of_images<T: Real>(config: &ImageEncoderConfig, weights: &impl Weights<T>) -> (Numbers<T>, Vec<Layer<T>>, usize) {
+    let (mut side, mut channels) = (SIZE as usize, CHANNELS as usize);
+    let mut layers = Vec::new();
+    for (i, conv) in config.convolutions.iter().enumerate() {
+        let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
+        let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
+        layers.push(Layer::Convolution(Convolution::new((side, channels), (kernel, stride), &weight, &bias)));
+        (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
     }
+    (Numbers::Pixels, layers, channels)
+}
 
-    /// Leaves the features, `[R, F]`, at the beginning of `room.x`.
-    fn features(&self, inputs: &[Observed<'_>], room: &mut Room<T>) {
-        let Room { x, y, convolution, .. } = room;
+/// The layers before the last; their features have no positions.
+fn of_positions<T: Real>(
+    config: &PositionEncoderConfig,
+    weights: &impl Weights<T>,
+) -> (Numbers<T>, Vec<Layer<T>>, usize) {
+    let numbers = Numbers::Position {
+        centre_metres: config.centre_mm.map(|mm| mm as f64 / 1e3),
+        scale_metres: T::from_f64(config.scale_mm as f64 / 1e3),
+    };
+    let layer = |i| Layer::Linear(Linear::named(&format!("encoder.layer.{i}"), weights));
+    (numbers, (0..config.layers.len()).map(layer).collect(), 1)
+}
+
+impl<T: Real> Layer<T> {
+    fn inputs(&self) -> usize {
         match self {
-            Self::Image { convolutions } => {
-                let numbers = grown(x, inputs.len() * BYTES + BEYOND);
-                for (x, input) in numbers.chunks_exact_mut(BYTES).zip(inputs) {
+            Self::Convolution(convolution) => convolution.inputs,
+            Self::Linear(linear) => linear.inputs,
+        }
+    }
+
+    fn outputs(&self) -> usize {
+        match self {
+            Self::Convolution(convolution) => convolution.outputs,
+            Self::Linear(linear) => linear.outputs,
+        }
+    }
+
+    fn gradient(&self) -> Vec<LinearGradient<T>> {
+        match self {
+            Self::Convolution(convolution) => convolution.gradient(),
+            Self::Linear(linear) => vec![linear.gradient()],
+        }
+    }
+
+    /// Of R = `rows` inputs.
+    fn forward(&self, rows: usize, x: &[T], y: &mut [T], room: &mut convolution::Room<T>) {
+        match self {
+            Self::Convolution(convolution) => convolution.forward(x, y, room),
+            Self::Linear(linear) => {
+                linear.forward(&x[..rows * linear.inputs], y);
+                rectify(y);
+            }
+        }
+    }
+
+    /// Adds to the gradient what ŷ gives, from behind the unit, and writes x̂ if it is asked for.
+    fn adjoint(
+        &self,
+        (rows, x, y_hat): (usize, &[T], &[T]),
+        x_hat: Option<&mut [T]>,
+        gradient: &mut [LinearGradient<T>],
+        room: &mut convolution::Room<T>,
+    ) {
+        match self {
+            Self::Convolution(convolution) => convolution.adjoint((x, y_hat), x_hat, gradient, room),
+            Self::Linear(linear) => {
+                linear.accumulate(linear.all(), rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
+                if let Some(x_hat) = x_hat {
+                    x_hat.fill(T::ZERO);
+                    linear.backward(linear.all(), y_hat, x_hat);
+                }
+            }
+        }
+    }
+}
+
+impl<T: Real> Numbers<T> {
+    fn write(&self, inputs: &[Observed<'_>], x: &mut [T]) {
+        match self {
+            Self::Pixels => {
+                for (x, input) in x.chunks_exact_mut(BYTES).zip(inputs) {
                     let Observed::Image(bytes) = input else { panic!("observations are checked as they arrive") };
                     Arch::new().dispatch(Scale { bytes, x });
                 }
-                for layer in convolutions {
-                    let size = inputs.len() * layer.outputs;
-                    layer.forward(x, &mut grown(y, size + BEYOND)[..size], convolution);
-                    std::mem::swap(x, y);
-                }
             }
-            Self::Position { centre_metres, scale_metres, layers } => {
-                let numbers = grown(x, inputs.len() * centre_metres.len());
-                for (x, input) in numbers.chunks_exact_mut(centre_metres.len()).zip(inputs) {
+            Self::Position { centre_metres, scale_metres } => {
+                for (x, input) in x.chunks_exact_mut(centre_metres.len()).zip(inputs) {
                     let Observed::Position(metres) = input else { panic!("observations are checked as they arrive") };
                     for (x, (at, centre)) in x.iter_mut().zip(metres.iter().zip(centre_metres)) {
                         *x = T::from_f64(f64::from(*at) - centre) / *scale_metres;
                     }
-                }
-                for layer in layers {
-                    let features = grown(y, inputs.len() * layer.outputs);
-                    layer.forward(&x[..inputs.len() * layer.inputs], features);
-                    rectify(features);
-                    std::mem::swap(x, y);
                 }
             }
         }
@@ -165,18 +327,6 @@ impl<T: Real> WithSimd for Scale<'_, T> {
         let (step, half) = (T::ONE / T::count(255), T::ONE / T::count(2));
         for (x, byte) in self.x.iter_mut().zip(self.bytes) {
             *x = T::from_u8(*byte) * step - half;
-        }
-    }
-}
-
-impl<T: Real> Norm<T> {
-    fn apply(&self, x: &mut [T]) {
-        let count = T::count(x.len());
-        let mean = x.iter().copied().sum::<T>() / count;
-        let variance = x.iter().map(|x| (*x - mean) * (*x - mean)).sum::<T>() / count;
-        let scale = T::ONE / (variance + T::from_f64(EPSILON)).sqrt();
-        for (x, (weight, bias)) in x.iter_mut().zip(self.weight.iter().zip(&self.bias)) {
-            *x = (*x - mean) * scale * *weight + *bias;
         }
     }
 }

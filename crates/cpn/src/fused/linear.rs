@@ -40,7 +40,7 @@ impl<T: Real> Linear<T> {
     pub fn new(weight: Vec<T>, bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
         let transposed = Panels::transposed(&weight, inputs);
-        Self { inputs, outputs, weight: Aligned::from_iter(0, weight), transposed, bias }
+        Self { inputs, outputs, weight: Aligned::from_slice(0, &weight), transposed, bias }
     }
 
     /// The layer of this name in a checkpoint.
@@ -109,7 +109,13 @@ impl<T: Real> Linear<T> {
     }
 }
 
-impl<T> LinearGradient<T> {
+impl<T: Real> LinearGradient<T> {
+    /// Adds another.
+    pub fn add(&mut self, other: &Self) {
+        add(&mut self.weight, &other.weight);
+        add(&mut self.bias, &other.bias);
+    }
+
     /// Both tensors, by their names in a checkpoint.
     pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
         vec![(format!("{name}.weight"), &mut self.weight), (format!("{name}.bias"), &mut self.bias)]

@@ -18,6 +18,7 @@
 
 mod convolution;
 mod dense;
+mod embedder;
 mod encoder;
 mod gate;
 mod gated;
@@ -27,13 +28,16 @@ mod linear;
 mod matrix;
 mod modulation;
 mod network;
+mod norm;
 mod outer;
 mod planner;
 mod product;
 mod real;
 mod sampling;
+mod tiles;
 mod winograd;
 
+pub use embedder::{Embedded, Embedder};
 pub use linear::{Weights, add};
 pub use outer::Samples;
 pub use planner::Planner;

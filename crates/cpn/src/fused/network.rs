@@ -277,7 +277,7 @@ impl<T: Real> Network<T> {
     }
 }
 
-impl<T> NetworkGradient<T> {
+impl<T: Real> NetworkGradient<T> {
     /// Every tensor, by its name in a checkpoint, without `network.` before it.
     pub fn tensors(&mut self) -> Vec<(String, &mut Aligned<T>)> {
         let mut tensors = self.trunk.tensors("trunk");

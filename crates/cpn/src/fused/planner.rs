@@ -1,6 +1,6 @@
 //! Plans without a graph, in memory that is kept from plan to plan.
 
-use super::encoder::{Encoder, Room};
+use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
 use super::linear::Weights;
 use super::network::{Buffers, Network};
@@ -44,7 +44,7 @@ pub(super) struct Dynamics<T> {
 /// One thread's memory.
 #[derive(Debug)]
 pub(super) struct Worker<T> {
-    room: Room<T>,
+    tape: Tape<T>,
     pub(super) rollout: Rollout<T>,
     pub(super) buffers: Buffers<T>,
     /// x along a rollout, then x̄, `[R, Z]`.
@@ -87,7 +87,7 @@ impl<T: Real> Worker<T> {
         let sizes = dynamics.network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];
         Self {
-            room: Room::new(),
+            tape: Tape::new(),
             rollout: Rollout::new(&dynamics.network, BLOCK, dynamics.horizon),
             buffers: dynamics.network.buffers(BLOCK),
             x: zeros(sizes.latent),
@@ -229,7 +229,10 @@ impl Method for Planner {
         if let Some(agent) = &self.half {
             return in_bfloat16(agent, inputs);
         }
-        spread(&mut self.workers, inputs, (1, BLOCK), |worker, inputs| encoder.encode(inputs, &mut worker.room))
+        spread(&mut self.workers, inputs, (1, BLOCK), |worker, inputs| {
+            let embeddings = encoder.forward(inputs, false, &mut worker.tape);
+            embeddings.chunks_exact(encoder.latent()).map(<[f32]>::to_vec).collect()
+        })
     }
 
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
@@ -257,7 +260,7 @@ fn in_bfloat16(agent: &Agent, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         Observed::Position(_) => panic!("observations are checked as they arrive"),
     });
     let images = images::from_bytes(&bytes.copied().collect::<Vec<_>>()).expect("whole images, and at least one");
-    let embeddings = floats::<f32>(&tch::no_grad(|| agent.encoder().encode_fast(&images, Precision::Bfloat16)));
+    let embeddings = floats::<f32>(&tch::no_grad(|| agent.encoder().encode_in_bfloat16(&images)));
     embeddings.chunks_exact(embeddings.len() / inputs.len()).map(<[f32]>::to_vec).collect()
 }
 

@@ -4,7 +4,8 @@
 
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
 use cpn::loss::Batch;
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
+use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, images};
+use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, Tensor};
@@ -38,9 +39,9 @@ pub fn double_agent(config: ModelConfig) -> Agent {
 
 /// Images of noise, `[B, 84, 84, 3]`.
 pub fn noise_images(batch: i64, seed: u64) -> Tensor {
-    let mut data = vec![0; batch as usize * cpn::images::BYTES];
+    let mut data = vec![0; batch as usize * images::BYTES];
     ChaCha8Rng::seed_from_u64(seed).fill(data.as_mut_slice());
-    cpn::images::from_bytes(&data).unwrap()
+    images::from_bytes(&data).unwrap()
 }
 
 /// Values in [-1, 1), float64.
@@ -61,4 +62,21 @@ pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Te
         actions: actions.shallow_clone(),
         mask: mask.shallow_clone(),
     }
+}
+
+/// Features of the largest of these encoders; over more, float32's linear layer alone rounds by more than 1e-5.
+const FEATURES: i64 = 8192;
+
+/// Encoders of one or two convolutions: kernels of one to four strides, or of a pixel more; images that end with a tile, or not.
+pub fn encoders() -> impl Strategy<Value = ImageEncoderConfig> {
+    let taps = (1i64..5, 1i64..5, 0i64..2).prop_map(|(taps, stride, more)| (taps * stride + more, stride));
+    let convolution = (prop_oneof![Just(16i64), Just(32), Just(5)], taps)
+        .prop_filter("a valid kernel", |(_, (kernel, _))| *kernel <= 8)
+        .prop_map(|(channels, (kernel, stride))| ConvConfig { channels, kernel, stride });
+    proptest::collection::vec(convolution, 1..3)
+        .prop_map(|convolutions| ImageEncoderConfig { convolutions, latent: 6, layer_norm: true })
+        .prop_filter("few enough features", |encoder| {
+            let side = encoder.convolutions.iter().fold(images::SIZE, |side, c| (side - c.kernel) / c.stride + 1);
+            side * side * encoder.convolutions[encoder.convolutions.len() - 1].channels <= FEATURES
+        })
 }

@@ -1,0 +1,76 @@
+//! Embeddings of a batch's frames, and the way back from them to the encoder's weights.
+
+use crate::agent::Agent;
+use crate::config::{Input, ModelConfig};
+use crate::encoder::Precision;
+use crate::fused::{Embedded, Embedder, Variables, floats};
+use crate::images;
+use crate::method::Observed;
+use tch::{Kind, Tensor};
+
+/// Embeds frames: in float32 without a graph, in bfloat16 by autograd.
+#[derive(Debug)]
+pub struct FrameEncoder {
+    embedder: Embedder<f32>,
+    input: Input,
+    precision: Precision,
+}
+
+/// From embeddings to the encoder's weights.
+#[derive(Debug)]
+pub enum WayBack<'a> {
+    /// Without a graph.
+    Fused(Embedded<'a, f32>),
+    /// By the graph of the embeddings.
+    Autograd(Tensor),
+}
+
+impl FrameEncoder {
+    /// For agents of a valid configuration, on some threads.
+    pub fn new(config: &ModelConfig, precision: Precision, threads: usize) -> Self {
+        let input = config.encoder.input();
+        // There is little to multiply for a position.
+        let precision = if input == Input::Position { Precision::Float32 } else { precision };
+        Self { embedder: Embedder::new(config.encoder.clone(), threads), input, precision }
+    }
+
+    /// Embeds frames, `[F, 84, 84, 3]` bytes or `[F, 3]` in metres, as `[F, Z]`.
+    pub fn embed(&mut self, agent: &Agent, frames: &Tensor) -> (Vec<f32>, WayBack<'_>) {
+        if self.precision == Precision::Bfloat16 {
+            let embeddings = agent.encoder().encode_in_bfloat16(frames);
+            return (floats(&embeddings.detach()), WayBack::Autograd(embeddings));
+        }
+        let variables = agent.variables().variables();
+        let (bytes, metres): (Vec<u8>, Vec<f32>);
+        let frames: Vec<_> = match self.input {
+            Input::Image => {
+                bytes = floats(frames);
+                bytes.chunks_exact(images::BYTES).map(Observed::Image).collect()
+            }
+            Input::Position => {
+                metres = floats(frames);
+                metres.as_chunks().0.iter().copied().map(Observed::Position).collect()
+            }
+        };
+        let (embeddings, embedded) = self.embedder.forward(&Variables(&variables), &frames);
+        (embeddings, WayBack::Fused(embedded))
+    }
+}
+
+impl WayBack<'_> {
+    /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name.
+    pub fn adjoint(self, agent: &Agent, hat: &[f32]) -> Vec<(String, Vec<f32>)> {
+        match self {
+            Self::Fused(embedded) => embedded.adjoint(hat),
+            Self::Autograd(embeddings) => {
+                // Autograd is told the gradient in the embeddings by a sum that has it.
+                let sum = (&embeddings * Tensor::from_slice(hat).view_as(&embeddings)).sum(None::<Kind>);
+                let variables = agent.variables().variables();
+                let (names, weights): (Vec<_>, Vec<_>) =
+                    variables.into_iter().filter(|(name, _)| name.starts_with("encoder.")).unzip();
+                let gradients = Tensor::run_backward(&[sum], &weights, false, false);
+                names.into_iter().zip(gradients.iter().map(floats)).collect()
+            }
+        }
+    }
+}

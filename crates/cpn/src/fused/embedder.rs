@@ -1,0 +1,62 @@
+//! The encoder in training: forward over the frames of a batch, and back to its weights.
+
+use super::encoder::{Encoder, EncoderGradient, INPUTS, Tape};
+use super::linear::Weights;
+use super::real::Real;
+use crate::config::EncoderConfig;
+use crate::method::Observed;
+use rayon::prelude::*;
+
+/// Embeds frames and leads gradients back, on some threads, in memory that is kept from batch to batch.
+#[derive(Debug)]
+pub struct Embedder<T> {
+    config: EncoderConfig,
+    /// By the weights of the last forward pass.
+    encoder: Option<Encoder<T>>,
+    tapes: Vec<Tape<T>>,
+}
+
+/// Frames that are embedded, until it is known what a loss changes by with their embeddings.
+#[derive(Debug)]
+pub struct Embedded<'a, T> {
+    encoder: &'a Encoder<T>,
+    /// Frames of a thread.
+    share: usize,
+    tapes: &'a mut [Tape<T>],
+}
+
+impl<T: Real> Embedder<T> {
+    /// For encoders of a valid configuration, on `threads` threads, at least one.
+    pub fn new(config: EncoderConfig, threads: usize) -> Self {
+        Self { config, encoder: None, tapes: (0..threads.max(1)).map(|_| Tape::new()).collect() }
+    }
+
+    /// Embeds frames, by what the weights are now, as `[F, Z]`.
+    pub fn forward(&mut self, weights: &impl Weights<T>, frames: &[Observed<'_>]) -> (Vec<T>, Embedded<'_, T>) {
+        let encoder = &*self.encoder.insert(Encoder::new(&self.config, weights));
+        let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(INPUTS);
+        let parts = self.tapes.par_iter_mut().zip(frames.par_chunks(share));
+        let embeddings: Vec<_> = parts.map(|(tape, frames)| encoder.forward(frames, true, tape)).collect();
+        (embeddings.concat(), Embedded { encoder, share, tapes: &mut self.tapes })
+    }
+}
+
+impl<T: Real> Embedded<'_, T> {
+    /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name in a checkpoint. The order of its sums
+    /// depends on nothing but the frames and the number of threads.
+    pub fn adjoint(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {
+        let Self { encoder, share, tapes } = self;
+        let parts = tapes.par_iter_mut().zip(x_hat.par_chunks(share * encoder.latent()));
+        let gradients: Vec<EncoderGradient<T>> = parts
+            .map(|(tape, x_hat)| {
+                let mut gradient = encoder.gradient();
+                encoder.adjoint(x_hat.to_vec(), &mut gradient, tape);
+                gradient
+            })
+            .collect();
+        let mut gradients = gradients.into_iter();
+        let mut sum = gradients.next().unwrap_or_else(|| encoder.gradient());
+        gradients.for_each(|gradient| sum.add(&gradient));
+        encoder.in_weights(&sum)
+    }
+}

@@ -1,0 +1,340 @@
+//! What [minimal filtering](super::winograd) adds up before and after its products.
+//!
+//! Four blocks in a row, d, give m sums of r = 5 - m taps, y, by four products, where g(t) = Σ gᵢ tⁱ and g(∞) is the last tap:
+//!
+//! - p₀ = (d₀ - d₂) g(0), p₁ = (d₁ + d₂) g(1)/2, p₂ = (d₂ - d₁) g(-1)/2, p₃ = (d₁ - d₃) g(∞)
+//! - y₀ = p₀ + p₁ + p₂, then if m = 3 p₁ - p₂, and last p₁ ± p₂ - p₃, with + if m = 3
+//!
+//! A tile does so in both directions. These points need only sums and halves, which cost float32 next to nothing. Each step has
+//! an adjoint, which leads a loss' gradient in what the step gives back to one in what it takes.
+
+use super::lanes::{Lanes, registers, registers_mut};
+use super::real::Real;
+use pulp::{Arch, Simd, WithSimd};
+use std::array;
+
+/// 0, 1, -1 and ∞: as many as a tile has blocks in a row.
+pub const POINTS: usize = 4;
+/// Of points, one for each direction.
+pub const PAIRS: usize = POINTS * POINTS;
+/// The pair of 1 in both directions.
+pub const ONES: usize = POINTS + 1;
+/// Numbers behind others, for registers that reach beyond their end: as many as the widest hold.
+pub const BEYOND: usize = 16;
+
+/// How images `[S, S, C]` are cut into tiles, and their outputs `[S', S', O]`.
+#[derive(Debug)]
+pub struct Tiles {
+    /// S.
+    side: usize,
+    /// C.
+    pub channels: usize,
+    pub stride: usize,
+    /// O, a multiple of [`BEYOND`].
+    pub outputs: usize,
+    /// S'.
+    size: usize,
+    /// m.
+    kept: usize,
+    /// The blocks and outputs where tiles begin, in either direction; the last early enough to end within the image.
+    starts: Vec<usize>,
+}
+
+impl Tiles {
+    /// None if the images are smaller than a tile.
+    pub fn new((side, channels): (usize, usize), stride: usize, kept: usize, outputs: usize) -> Option<Self> {
+        let size = (side / stride + kept).checked_sub(POINTS)?;
+        let starts = (0..size).step_by(kept).map(|start| start.min(size - kept));
+        (size >= kept).then(|| Self { side, channels, stride, outputs, size, kept, starts: starts.collect() })
+    }
+
+    /// Of an image.
+    pub fn in_image(&self) -> usize {
+        self.starts.len().pow(2)
+    }
+
+    /// Numbers of an image, and of its outputs.
+    pub fn sizes(&self) -> [usize; 2] {
+        [self.side * self.side * self.channels, self.size * self.size * self.outputs]
+    }
+
+    /// Numbers of the memory that the steps work in.
+    pub fn part(&self) -> usize {
+        (POINTS * (self.band() + BEYOND)).max((POINTS + 1) * self.kept * self.outputs)
+    }
+
+    /// Numbers of a block's part of a line.
+    fn run(&self) -> usize {
+        self.stride * self.channels
+    }
+
+    /// Numbers of a line of the image.
+    fn line(&self) -> usize {
+        self.side * self.channels
+    }
+
+    /// Numbers of the lines that a row of blocks takes.
+    fn band(&self) -> usize {
+        self.stride * self.line()
+    }
+
+    /// From images to d, combined in both directions: for each pair of points `[tiles, D]`, with [`BEYOND`] numbers behind both.
+    pub fn enter<T: Real>(&self, x: &[T], d: &mut [T], part: &mut [T]) {
+        Arch::new().dispatch(Enter { tiles: self, x, d, part });
+    }
+
+    /// Writes x̂ from d̂.
+    pub fn enter_adjoint<T: Real>(&self, d: &[T], x: &mut [T], part: &mut [T]) {
+        x.fill(T::ZERO);
+        Arch::new().dispatch(EnterAdjoint { tiles: self, d, x, part });
+    }
+
+    /// From p, for each pair of points `[tiles, O]`, to outputs, rectified.
+    pub fn leave<T: Real>(&self, p: &[T], y: &mut [T], part: &mut [T]) {
+        match self.kept {
+            2 => Arch::new().dispatch(Leave::<T, 2> { tiles: self, p, y, part }),
+            _ => Arch::new().dispatch(Leave::<T, 3> { tiles: self, p, y, part }),
+        }
+    }
+
+    /// Writes p̂ from ŷ behind the unit.
+    pub fn leave_adjoint<T: Real>(&self, y: &[T], p: &mut [T], part: &mut [T]) {
+        match self.kept {
+            2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, y, p, part }),
+            _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, y, p, part }),
+        }
+    }
+}
+
+/// What a register writes beyond the end of a line, or of a block's part of it, is overwritten by what comes next.
+#[derive(Debug)]
+struct Enter<'a, T> {
+    tiles: &'a Tiles,
+    x: &'a [T],
+    d: &'a mut [T],
+    part: &'a mut [T],
+}
+
+impl<T: Real> WithSimd for Enter<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, x, d, part } = self;
+        let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
+        let count = (d.len() / PAIRS - BEYOND) / (stride * run);
+        let mut lines = parts::<T, POINTS>(&mut part[..POINTS * (band + BEYOND)]);
+        let mut d = parts::<T, PAIRS>(d);
+        for (row, first) in (0..count).step_by(starts.len()).enumerate() {
+            let x = &x[row / starts.len() * tiles.sizes()[0] + starts[row % starts.len()] * band..];
+            let bands = [x, &x[band..], &x[2 * band..], &x[3 * band..]];
+            combine(simd, band, bands, lines.each_mut().map(|lines| &mut lines[..]));
+            for (lines, d) in lines.iter().zip(d.as_chunks_mut::<POINTS>().0) {
+                for (t, left) in starts.iter().enumerate() {
+                    for y in 0..*stride {
+                        let block = |j| &lines[y * line + (left + j) * run..];
+                        let into = d.each_mut().map(|d| &mut d[((first + t) * stride + y) * run..]);
+                        combine(simd, run, [block(0), block(1), block(2), block(3)], into);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[derive(Debug)]
+struct EnterAdjoint<'a, T> {
+    tiles: &'a Tiles,
+    d: &'a [T],
+    x: &'a mut [T],
+    part: &'a mut [T],
+}
+
+impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, d, x, part } = self;
+        let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
+        let apart = d.len() / PAIRS;
+        let part = &mut part[..POINTS * band];
+        let mut first = 0;
+        for image in x.chunks_exact_mut(tiles.sizes()[0]) {
+            for top in starts {
+                part.fill(T::ZERO);
+                for (i, lines) in part.chunks_exact_mut(band).enumerate() {
+                    for (t, left) in starts.iter().enumerate() {
+                        for y in 0..*stride {
+                            let block = |j| &d[(i * POINTS + j) * apart + ((first + t) * stride + y) * run..][..run];
+                            let into = parts::<T, POINTS>(&mut lines[y * line + left * run..][..POINTS * run]);
+                            combine_adjoint(simd, [block(0), block(1), block(2), block(3)], into);
+                        }
+                    }
+                }
+                let bands = |i| &part[i * band..][..band];
+                let into = parts::<T, POINTS>(&mut image[top * band..][..POINTS * band]);
+                combine_adjoint(simd, [bands(0), bands(1), bands(2), bands(3)], into);
+                first += starts.len();
+            }
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Leave<'a, T, const KEPT: usize> {
+    tiles: &'a Tiles,
+    p: &'a [T],
+    y: &'a mut [T],
+    part: &'a mut [T],
+}
+
+impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, p, y, part } = self;
+        let apart = p.len() / PAIRS;
+        // [m, POINTS, O]
+        let half = &mut part[..KEPT * POINTS * outputs];
+        let mut tile = 0;
+        for image in y.chunks_exact_mut(size * size * outputs) {
+            for (top, left) in starts.iter().flat_map(|top| starts.iter().map(move |left| (top, left))) {
+                for j in 0..POINTS {
+                    let row = |i| &p[(i * POINTS + j) * apart + tile * outputs..];
+                    let into = parts::<T, KEPT>(half).map(|half| &mut half[j * outputs..]);
+                    keep(simd, outputs, [row(0), row(1), row(2), row(3)], into, |y| y);
+                }
+                for (i, half) in half.chunks_exact(POINTS * outputs).enumerate() {
+                    let column = |j| &half[j * outputs..];
+                    let into = &mut image[((top + i) * size + left) * outputs..][..KEPT * outputs];
+                    let columns = [column(0), column(1), column(2), column(3)];
+                    keep(simd, outputs, columns, parts::<T, KEPT>(into), Lanes::rectified);
+                }
+                tile += 1;
+            }
+        }
+    }
+}
+
+#[derive(Debug)]
+struct LeaveAdjoint<'a, T, const KEPT: usize> {
+    tiles: &'a Tiles,
+    y: &'a [T],
+    p: &'a mut [T],
+    part: &'a mut [T],
+}
+
+impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, y, p, part } = self;
+        let (apart, width) = (p.len() / PAIRS, KEPT * outputs);
+        // [POINTS, m, O], and zeros.
+        let (half, nothing) = part.split_at_mut(POINTS * width);
+        nothing[..width].fill(T::ZERO);
+        let mut tile = 0;
+        for image in y.chunks_exact(size * size * outputs) {
+            for (down, top) in starts.iter().enumerate() {
+                for (across, left) in starts.iter().enumerate() {
+                    // What a tile has in common with the one before counts there alone.
+                    let (above, before) = (down * KEPT - top, across * KEPT - left);
+                    let row = |i| if i < above { &*nothing } else { &image[((top + i) * size + left) * outputs..] };
+                    keep_adjoint(simd, width, array::from_fn::<_, KEPT, _>(row), parts::<T, POINTS>(half));
+                    for (half, p) in half.chunks_exact(width).zip(p.chunks_exact_mut(POINTS * apart)) {
+                        let column = |j| if j < before { &*nothing } else { &half[j * outputs..] };
+                        let into = parts::<T, POINTS>(p).map(|p| &mut p[tile * outputs..]);
+                        keep_adjoint(simd, outputs, array::from_fn::<_, KEPT, _>(column), into);
+                    }
+                    tile += 1;
+                }
+            }
+        }
+    }
+}
+
+/// Of d in a row, each `length` numbers, what the products are made of.
+#[inline(always)]
+fn combine<S: Simd, T: Real>(simd: S, length: usize, d: [&[T]; POINTS], into: [&mut [T]; POINTS]) {
+    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let d = registers(simd, d, count);
+    let into = registers_mut(simd, into, count);
+    for i in 0..count {
+        let [d0, d1, d2, d3] = Lanes::<S, T>::each(simd, [d[0][i], d[1][i], d[2][i], d[3][i]]);
+        into[0][i] = (d0 - d2).values();
+        into[1][i] = (d1 + d2).values();
+        into[2][i] = (d2 - d1).values();
+        into[3][i] = (d1 - d3).values();
+    }
+}
+
+/// Adds to d̂ in a row, from what the products were made of.
+#[inline(always)]
+fn combine_adjoint<S: Simd, T: Real>(simd: S, from: [&[T]; POINTS], d: [&mut [T]; POINTS]) {
+    let [d0, d1, d2, d3] = d;
+    for at in (0..d0.len()).step_by(Lanes::<S, T>::COUNT) {
+        let mut rest = from;
+        for part in &mut rest {
+            *part = &part[at..];
+        }
+        let [p0, p1, p2, p3] = Lanes::<S, T>::load_each(simd, rest);
+        p0.add_to(&mut d0[at..]);
+        (p1 - p2 + p3).add_to(&mut d1[at..]);
+        (p1 + p2 - p0).add_to(&mut d2[at..]);
+        (Lanes::splat(simd, T::ZERO) - p3).add_to(&mut d3[at..]);
+    }
+}
+
+/// Of p in a row, each `length` numbers, what it adds up to.
+#[inline(always)]
+fn keep<S: Simd, T: Real, const KEPT: usize>(
+    simd: S,
+    length: usize,
+    p: [&[T]; POINTS],
+    into: [&mut [T]; KEPT],
+    finish: impl Fn(Lanes<S, T>) -> Lanes<S, T>,
+) {
+    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let p = registers(simd, p, count);
+    let into = registers_mut(simd, into, count);
+    for i in 0..count {
+        let [p0, p1, p2, p3] = Lanes::<S, T>::each(simd, [p[0][i], p[1][i], p[2][i], p[3][i]]);
+        let (sum, difference) = (p1 + p2, p1 - p2);
+        into[0][i] = finish(p0 + sum).values();
+        into[1][i] = finish(if KEPT == 2 { difference - p3 } else { difference }).values();
+        if KEPT == 3 {
+            into[2][i] = finish(sum - p3).values();
+        }
+    }
+}
+
+/// Of ŷ in a row, each `length` numbers, p̂.
+#[inline(always)]
+fn keep_adjoint<S: Simd, T: Real, const KEPT: usize>(
+    simd: S,
+    length: usize,
+    y: [&[T]; KEPT],
+    into: [&mut [T]; POINTS],
+) {
+    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let y = registers(simd, y, count);
+    let into = registers_mut(simd, into, count);
+    for i in 0..count {
+        let [first, second, last] = Lanes::<S, T>::each(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
+        let even = if KEPT == 2 { first } else { first + last };
+        into[0][i] = first.values();
+        into[1][i] = (even + second).values();
+        into[2][i] = (even - second).values();
+        into[3][i] = (Lanes::splat(simd, T::ZERO) - last).values();
+    }
+}
+
+/// N equal parts.
+#[inline(always)]
+fn parts<T, const N: usize>(slice: &mut [T]) -> [&mut [T]; N] {
+    let mut parts = slice.chunks_exact_mut(slice.len() / N);
+    array::from_fn(|_| parts.next().unwrap_or_default())
+}
