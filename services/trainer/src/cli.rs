@@ -135,6 +135,13 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip)]
     pub json: bool,
+    /// First follow the network's demonstrations until so many are kept.
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip)]
+    pub demonstrations: Option<usize>,
+    #[command(flatten)]
+    #[serde(skip)]
+    pub session: SessionConfig,
 }
 
 /// Which trainer is asked.

@@ -13,6 +13,7 @@ use comfy_table::{LineStyle, Table, presets};
 use cpn::Preset;
 use serde::Deserialize;
 use serde::de::{IntoDeserializer, value};
+use service_kit::session::SessionConfig;
 use service_kit::{config, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -35,7 +36,13 @@ async fn main() -> anyhow::Result<()> {
         }
         Command::Train(arguments) => {
             memory::keep()?;
-            train(Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?, arguments.json).await
+            let config = Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?;
+            if let Some(count) = arguments.demonstrations
+                && !gather(&config, count, &arguments.session).await?
+            {
+                return Ok(());
+            }
+            train(config, arguments.json).await
         }
         Command::Preset(arguments) => print_preset(&arguments),
         Command::Start(arguments) => start(arguments).await,
@@ -58,6 +65,19 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
         signal = shutdown::requested() => signal?,
     }
     service.shutdown().await
+}
+
+/// Follows the network until so many demonstrations are kept; answers whether they are, or it was told to stop before.
+async fn gather(config: &Config, count: usize, network: &SessionConfig) -> anyhow::Result<bool> {
+    let recordings = Arc::new(Recordings::open(config.dataset.clone())?);
+    let session = session::open(network).await?;
+    let enough = tokio::select! {
+        done = mirror::follow(&session, &recordings, count) => done.map(|()| true).map_err(|e| anyhow!(e))?,
+        signal = shutdown::requested() => signal.map(|()| false)?,
+    };
+    session.close().await.map_err(|e| anyhow!(e))?;
+    tracing::info!(kept = recordings.count(), of = count, "demonstrations from the network");
+    Ok(enough)
 }
 
 async fn train(config: Config, json: bool) -> anyhow::Result<()> {
@@ -156,7 +176,11 @@ async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Re
     let recordings = Arc::new(Recordings::open(dataset)?);
     let session = session::open(&session).await?;
     let work = async {
-        if once { Ok(mirror::once(&session, &recordings).await?) } else { mirror::follow(&session, &recordings).await }
+        if once {
+            Ok(mirror::once(&session, &recordings).await?)
+        } else {
+            mirror::follow(&session, &recordings, usize::MAX).await
+        }
     };
     tokio::select! {
         done = work => done.map_err(|e| anyhow!(e))?,

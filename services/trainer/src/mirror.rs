@@ -1,4 +1,4 @@
-//! A late joiner: fetches what other recorders keep, then follows them.
+//! A late joiner: fetches what other recorders keep, then follows them, for good or until there is enough to train on.
 
 use crate::recordings::Recordings;
 use crate::replay::{is_passing, patience};
@@ -37,21 +37,23 @@ pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(),
     attempt.retry(patience()).when(is_passing).await
 }
 
-/// Does the same, and then fetches each episode as it is announced, for as long as it is polled.
+/// Does the same, and then fetches each episode as it is announced, until `enough` are kept.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
-pub async fn follow(session: &Session, recordings: &Arc<Recordings>) -> zenoh::Result<()> {
+pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usize) -> zenoh::Result<()> {
     let announcements =
         session.declare_subscriber(key::demonstration_recorded("*")?).with(RingChannel::new(ANNOUNCEMENTS)).await?;
-    loop {
+    while recordings.count() < enough {
         match pass(session, recordings).await {
             Ok(Pass { offered, fetched }) if fetched > 0 => info!(offered, fetched, "mirrored"),
             Ok(_) => {}
             Err(error) => warn!(%error, "not mirrored; tried again"),
         }
         let next_pass = Instant::now() + POLL_INTERVAL;
-        while let Ok(announcement) = tokio::time::timeout_at(next_pass, announcements.recv_async()).await {
+        while recordings.count() < enough
+            && let Ok(announcement) = tokio::time::timeout_at(next_pass, announcements.recv_async()).await
+        {
             let episode = wire::decode(&announcement?.payload().to_bytes());
             let taken = async { take(session, recordings, episode?).await };
             if let Err(error) = taken.await {
@@ -59,6 +61,7 @@ pub async fn follow(session: &Session, recordings: &Arc<Recordings>) -> zenoh::R
             }
         }
     }
+    Ok(())
 }
 
 struct Pass {

@@ -69,6 +69,11 @@ impl Recordings {
         self.index().by_id.get(episode_id).cloned()
     }
 
+    /// How many episodes are kept.
+    pub fn count(&self) -> usize {
+        self.index().by_id.len()
+    }
+
     /// Every kept episode, by id.
     pub fn all(&self) -> Vec<RecordedEpisode> {
         self.index().by_id.values().cloned().collect()

@@ -52,7 +52,7 @@ async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
 
     let following = {
         let (joiner, copies) = (joiner.clone(), Arc::clone(&copies));
-        tokio::spawn(async move { mirror::follow(&joiner, &copies).await })
+        tokio::spawn(async move { mirror::follow(&joiner, &copies, usize::MAX).await })
     };
     for seed in 3..6 {
         replay::send(&joiner, &episode("reach", seed, 4)).await.unwrap();
@@ -65,6 +65,47 @@ async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
     tokio::time::timeout(Duration::from_secs(60), caught_up).await.expect("the new episodes to be mirrored");
     following.abort();
     assert_eq!(files(to.path()), files(from.path()));
+}
+
+/// The real process, which is up before the last demonstrations are.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_follows_the_stream_until_it_has_enough() {
+    let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    dataset(from.path());
+    let endpoint = "tcp/127.0.0.1:17474";
+    let (trainer, sender) = sessions(endpoint).await;
+    let _recorder = record(&trainer, from.path(), Limits::default()).await;
+    let out = to.path().join("live.safetensors");
+    let mut run = tokio::process::Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
+        .args([
+            "train",
+            "--json",
+            "--preset",
+            "paper-bc",
+            "--set",
+            "training.batch_size=8",
+            "--set",
+            "training.epochs=1",
+        ])
+        .args(["--demonstrations", "5", "--connect", endpoint, "--dataset"])
+        .args([&to.path().join("data"), Path::new("--out"), &out, Path::new("--run-dir"), &to.path().join("run")])
+        .kill_on_drop(true)
+        .spawn()
+        .unwrap();
+    let copies = to.path().join("data");
+    while !copies.is_dir() || files(&copies) != files(from.path()) {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert!(run.try_wait().unwrap().is_none(), "three are not enough");
+    for seed in 3..5 {
+        replay::send(&sender, &episode("reach", seed, 4)).await.unwrap();
+    }
+    let ended = tokio::time::timeout(Duration::from_secs(60), run.wait()).await.expect("the run to end").unwrap();
+    assert!(ended.success());
+    assert_eq!(files(&copies), files(from.path()));
+    let trained = cpn::checkpoint::from_bytes(&std::fs::read(out).unwrap()).unwrap().provenance;
+    let all = Dataset::load(from.path(), &[], Input::Image).unwrap();
+    assert_eq!(trained.data_digest, all.digest());
 }
 
 #[tokio::test(flavor = "multi_thread")]
