@@ -6,6 +6,7 @@ use crate::encoder::Precision;
 use crate::fused::{Embedded, Embedder, Variables, floats};
 use crate::images;
 use crate::method::Observed;
+use std::collections::HashMap;
 use tch::{Kind, Tensor};
 
 /// Embeds frames: in float32 without a graph, in bfloat16 by autograd.
@@ -34,13 +35,17 @@ impl FrameEncoder {
         Self { embedder: Embedder::new(config.encoder.clone(), threads), input, precision }
     }
 
-    /// Embeds frames, `[F, 84, 84, 3]` bytes or `[F, 3]` in metres, as `[F, Z]`.
-    pub fn embed(&mut self, agent: &Agent, frames: &Tensor) -> (Vec<f32>, WayBack<'_>) {
+    /// Embeds frames, `[F, 84, 84, 3]` bytes or `[F, 3]` in metres, as `[F, Z]`; `variables` are the agent's.
+    pub fn embed(
+        &mut self,
+        agent: &Agent,
+        variables: &HashMap<String, Tensor>,
+        frames: &Tensor,
+    ) -> (Vec<f32>, WayBack<'_>) {
         if self.precision == Precision::Bfloat16 {
             let embeddings = agent.encoder().encode_in_bfloat16(frames);
             return (floats(&embeddings.detach()), WayBack::Autograd(embeddings));
         }
-        let variables = agent.variables().variables();
         let (bytes, metres): (Vec<u8>, Vec<f32>);
         let frames: Vec<_> = match self.input {
             Input::Image => {
@@ -52,24 +57,23 @@ impl FrameEncoder {
                 metres.as_chunks().0.iter().copied().map(Observed::Position).collect()
             }
         };
-        let (embeddings, embedded) = self.embedder.forward(&Variables(&variables), &frames);
+        let (embeddings, embedded) = self.embedder.forward(&Variables(variables), &frames);
         (embeddings, WayBack::Fused(embedded))
     }
 }
 
 impl WayBack<'_> {
     /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name.
-    pub fn adjoint(self, agent: &Agent, hat: &[f32]) -> Vec<(String, Vec<f32>)> {
+    pub fn adjoint(self, variables: &HashMap<String, Tensor>, hat: &[f32]) -> Vec<(String, Vec<f32>)> {
         match self {
             Self::Fused(embedded) => embedded.adjoint(hat),
             Self::Autograd(embeddings) => {
                 // Autograd is told the gradient in the embeddings by a sum that has it.
                 let sum = (&embeddings * Tensor::from_slice(hat).view_as(&embeddings)).sum(None::<Kind>);
-                let variables = agent.variables().variables();
                 let (names, weights): (Vec<_>, Vec<_>) =
-                    variables.into_iter().filter(|(name, _)| name.starts_with("encoder.")).unzip();
+                    variables.iter().filter(|(name, _)| name.starts_with("encoder.")).unzip();
                 let gradients = Tensor::run_backward(&[sum], &weights, false, false);
-                names.into_iter().zip(gradients.iter().map(floats)).collect()
+                names.into_iter().cloned().zip(gradients.iter().map(floats)).collect()
             }
         }
     }

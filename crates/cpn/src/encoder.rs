@@ -12,16 +12,16 @@ use tch::{Kind, Tensor};
 pub enum Precision {
     /// As everywhere else.
     Float32,
-    /// Where the processor has tiles for it, faster for many images at once, and close; elsewhere slower.
+    /// Where the processor has tiles for it (AMX), faster for many images at once, and close; elsewhere no faster, or far slower.
     Bfloat16,
 }
 
 impl Precision {
-    /// The same, or float32 where that is faster.
+    /// The same, or float32 where the processor has no tiles for bfloat16.
     pub fn where_faster(self) -> Self {
-        // The tiles (AMX) cannot be asked for; the processors that have them are those that multiply float16.
+        // AMX-BF16, which the standard library cannot name yet.
         #[cfg(target_arch = "x86_64")]
-        let faster = is_x86_feature_detected!("avx512fp16");
+        let faster = std::arch::x86_64::__cpuid_count(7, 0).edx & (1 << 22) != 0;
         #[cfg(not(target_arch = "x86_64"))]
         let faster = false;
         if faster { self } else { Self::Float32 }

@@ -6,7 +6,7 @@ use tch::{Kind, Tensor};
 pub const SIZE: i64 = 84;
 /// Colour channels: red, green, blue.
 pub const CHANNELS: i64 = 3;
-/// Width and height of the blocks that [`blocks`] cuts images into, in pixels: the first stride of the paper's encoder.
+/// Width and height of the blocks that [`blocks_in_bfloat16`] cuts images into, in pixels: the first stride of the paper's encoder.
 pub const BLOCK: i64 = 4;
 /// Bytes of one image.
 pub const BYTES: usize = (SIZE * SIZE * CHANNELS) as usize;

@@ -42,7 +42,7 @@ pub struct Gradient {
     pub encoder_seconds: f64,
 }
 
-/// Differentiates outer losses without a graph ([`crate::fused`]).
+/// Differentiates outer losses without a graph ([`crate::fused`]), but for an encoder in bfloat16.
 #[derive(Debug)]
 pub struct OuterLoss {
     frames: FrameEncoder,
@@ -62,14 +62,14 @@ impl OuterLoss {
     /// makes of [`Agent::outer_loss`].
     pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
         let started = Instant::now();
-        let (embeddings, way_back) = self.frames.embed(agent, &batch.frames);
+        let variables = agent.variables().variables();
+        let (embeddings, way_back) = self.frames.embed(agent, &variables, &batch.frames);
         let encoding = started.elapsed();
         let latent = agent.config().encoder.latent() as usize;
         let rows = |indices: &Tensor| floats::<i64>(indices).into_iter().map(|row| row as usize * latent);
         let gather = |indices| rows(indices).flat_map(|at| &embeddings[at..at + latent]).copied().collect::<Vec<f32>>();
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
         let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
-        let variables = agent.variables().variables();
         let samples = Samples { x: &x, x_g: &x_g, actions: &actions, mask: &mask };
         let outer = self.fused.run(&Variables(&variables), samples);
 
@@ -80,7 +80,7 @@ impl OuterLoss {
             }
         }
         let started = Instant::now();
-        let in_encoder = way_back.adjoint(agent, &hat);
+        let in_encoder = way_back.adjoint(&variables, &hat);
         Gradient {
             loss: outer.loss.into(),
             weights: outer.weights.into_iter().chain(in_encoder).collect(),

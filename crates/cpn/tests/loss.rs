@@ -77,4 +77,9 @@ fn it_repeats_bit_for_bit() {
     let (first, again, threaded) = (differentiate(1), differentiate(1), differentiate(3));
     assert_eq!(first.weights, again.weights);
     assert!((first.loss - threaded.loss).abs() < 1e-5 * first.loss);
+    for (name, weights) in &first.weights {
+        let (ours, others) = (Tensor::from_slice(weights), Tensor::from_slice(&threaded.weights[name]));
+        let length = ours.norm().double_value(&[]);
+        assert!((&ours - others).norm().double_value(&[]) <= 1e-4 * length, "{name}");
+    }
 }

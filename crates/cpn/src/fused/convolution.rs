@@ -72,7 +72,7 @@ impl<T: Real> Convolution<T> {
         }
     }
 
-    /// Adds to the gradient what ŷ gives, from behind the unit, and writes x̂ if it is asked for.
+    /// Adds to the gradient what ŷ gives, which is a gradient in what the unit takes, and writes x̂ if it is asked for.
     pub fn adjoint(
         &self,
         (x, y_hat): (&[T], &[T]),

@@ -7,7 +7,7 @@ use crate::config::EncoderConfig;
 use crate::method::Observed;
 use rayon::prelude::*;
 
-/// Embeds frames and leads gradients back, on some threads, in memory that is kept from batch to batch.
+/// Embeds frames and leads gradients back, on some threads, whose tapes are kept from batch to batch.
 #[derive(Debug)]
 pub struct Embedder<T> {
     config: EncoderConfig,

@@ -22,7 +22,7 @@ pub const INPUTS: usize = 4;
 pub struct Encoder<T> {
     numbers: Numbers<T>,
     layers: Vec<Layer<T>>,
-    /// Of the features, whose order is positions first in the checkpoint, and last here: the weights are turned rather than them.
+    /// Of the features, which have their channels first in the checkpoint and last here: the weights are turned rather than they.
     channels: usize,
     linear: Linear<T>,
     norm: Option<Norm<T>>,
@@ -120,18 +120,18 @@ impl<T: Real> Encoder<T> {
         }
     }
 
-    /// After a [`Self::forward`] for it: adds to the gradient what x̂ gives, `[R, Z]`.
-    pub fn adjoint(&self, mut x_hat: Vec<T>, gradient: &mut EncoderGradient<T>, tape: &mut Tape<T>) {
-        let rows = x_hat.len() / self.latent();
+    /// After a [`Self::forward`] for it: adds to the gradient what a gradient in the embeddings gives, `[R, Z]`.
+    pub fn adjoint(&self, mut hat: Vec<T>, gradient: &mut EncoderGradient<T>, tape: &mut Tape<T>) {
+        let rows = hat.len() / self.latent();
         if let (Some(norm), Some(gradient)) = (&self.norm, &mut gradient.norm) {
-            norm.adjoint(&tape.x, &mut x_hat, gradient);
+            norm.adjoint(&tape.x, &mut hat, gradient);
         }
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
         let features_hat = grown(&mut tape.features_hat, features.len());
         features_hat.fill(T::ZERO);
-        self.linear.accumulate(self.linear.all(), rows, (features, &x_hat), &mut gradient.linear);
-        self.linear.backward(self.linear.all(), &x_hat, features_hat);
+        self.linear.accumulate(self.linear.all(), rows, (features, &hat), &mut gradient.linear);
+        self.linear.backward(self.linear.all(), &hat, features_hat);
         for (xs, (mut y, y_hat)) in tape.groups.iter().zip(features.chunks(group).zip(features_hat.chunks(group))) {
             let inputs = y.len() / self.linear.inputs;
             grown(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
@@ -185,6 +185,9 @@ impl<T: Real> Encoder<T> {
         tape: &mut [Aligned<T>],
         room: &mut convolution::Room<T>,
     ) {
+        if self.layers.is_empty() {
+            return self.numbers.write(inputs, features);
+        }
         let mut rest = tape;
         for (l, layer) in self.layers.iter().enumerate() {
             let Some((x, others)) = rest.split_first_mut() else { break };
@@ -270,7 +273,7 @@ impl<T: Real> Layer<T> {
         }
     }
 
-    /// Adds to the gradient what ŷ gives, from behind the unit, and writes x̂ if it is asked for.
+    /// Adds to the gradient what ŷ gives, which is a gradient in what the unit takes, and writes x̂ if it is asked for.
     fn adjoint(
         &self,
         (rows, x, y_hat): (usize, &[T], &[T]),

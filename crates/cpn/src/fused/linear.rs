@@ -29,7 +29,7 @@ pub struct Linear<T> {
 /// What a loss changes by when the weights do.
 #[derive(Debug, Clone)]
 pub struct LinearGradient<T> {
-    /// `[outputs, inputs]`.
+    /// `[outputs, inputs]`; of a norm `[Z]`, as the other.
     pub weight: Aligned<T>,
     /// `[outputs]`.
     pub bias: Aligned<T>,

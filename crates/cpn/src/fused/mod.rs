@@ -13,8 +13,9 @@
 //! second order costs two passes more than the first and nothing is recorded but what the passes leave on a [tape](dense).
 //! The same quantities serve both branches of g_θ, and the policy's rollout is also the first rollout of the inner loop.
 //!
-//! A block of samples goes through everything before the next one does, so that its tapes stay in the processor's caches.
-//! Tested against autograd in float64 (`tests/fused.rs`).
+//! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
+//! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
+//! ([`Embedder`]). Tested against autograd in float64 (`tests/fused.rs`).
 
 mod convolution;
 mod dense;

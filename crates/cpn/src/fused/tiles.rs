@@ -59,7 +59,7 @@ impl Tiles {
     }
 
     /// Numbers of the memory that the steps work in.
-    pub fn part(&self) -> usize {
+    pub fn room(&self) -> usize {
         (POINTS * (self.band() + BEYOND)).max((POINTS + 1) * self.kept * self.outputs)
     }
 
@@ -79,29 +79,29 @@ impl Tiles {
     }
 
     /// From images to d, combined in both directions: for each pair of points `[tiles, D]`, with [`BEYOND`] numbers behind both.
-    pub fn enter<T: Real>(&self, x: &[T], d: &mut [T], part: &mut [T]) {
-        Arch::new().dispatch(Enter { tiles: self, x, d, part });
+    pub fn enter<T: Real>(&self, x: &[T], d: &mut [T], room: &mut [T]) {
+        Arch::new().dispatch(Enter { tiles: self, x, d, room });
     }
 
     /// Writes x̂ from d̂.
-    pub fn enter_adjoint<T: Real>(&self, d: &[T], x: &mut [T], part: &mut [T]) {
+    pub fn enter_adjoint<T: Real>(&self, d: &[T], x: &mut [T], room: &mut [T]) {
         x.fill(T::ZERO);
-        Arch::new().dispatch(EnterAdjoint { tiles: self, d, x, part });
+        Arch::new().dispatch(EnterAdjoint { tiles: self, d, x, room });
     }
 
     /// From p, for each pair of points `[tiles, O]`, to outputs, rectified.
-    pub fn leave<T: Real>(&self, p: &[T], y: &mut [T], part: &mut [T]) {
+    pub fn leave<T: Real>(&self, p: &[T], y: &mut [T], room: &mut [T]) {
         match self.kept {
-            2 => Arch::new().dispatch(Leave::<T, 2> { tiles: self, p, y, part }),
-            _ => Arch::new().dispatch(Leave::<T, 3> { tiles: self, p, y, part }),
+            2 => Arch::new().dispatch(Leave::<T, 2> { tiles: self, p, y, room }),
+            _ => Arch::new().dispatch(Leave::<T, 3> { tiles: self, p, y, room }),
         }
     }
 
-    /// Writes p̂ from ŷ behind the unit.
-    pub fn leave_adjoint<T: Real>(&self, y: &[T], p: &mut [T], part: &mut [T]) {
+    /// Writes p̂ from ŷ, which is a gradient in what the unit takes.
+    pub fn leave_adjoint<T: Real>(&self, y: &[T], p: &mut [T], room: &mut [T]) {
         match self.kept {
-            2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, y, p, part }),
-            _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, y, p, part }),
+            2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, y, p, room }),
+            _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, y, p, room }),
         }
     }
 }
@@ -112,7 +112,7 @@ struct Enter<'a, T> {
     tiles: &'a Tiles,
     x: &'a [T],
     d: &'a mut [T],
-    part: &'a mut [T],
+    room: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for Enter<'_, T> {
@@ -120,10 +120,10 @@ impl<T: Real> WithSimd for Enter<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: tiles @ Tiles { stride, starts, .. }, x, d, part } = self;
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, x, d, room } = self;
         let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
         let count = (d.len() / PAIRS - BEYOND) / (stride * run);
-        let mut lines = parts::<T, POINTS>(&mut part[..POINTS * (band + BEYOND)]);
+        let mut lines = parts::<T, POINTS>(&mut room[..POINTS * (band + BEYOND)]);
         let mut d = parts::<T, PAIRS>(d);
         for (row, first) in (0..count).step_by(starts.len()).enumerate() {
             let x = &x[row / starts.len() * tiles.sizes()[0] + starts[row % starts.len()] * band..];
@@ -147,7 +147,7 @@ struct EnterAdjoint<'a, T> {
     tiles: &'a Tiles,
     d: &'a [T],
     x: &'a mut [T],
-    part: &'a mut [T],
+    room: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
@@ -155,15 +155,15 @@ impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: tiles @ Tiles { stride, starts, .. }, d, x, part } = self;
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, d, x, room } = self;
         let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
         let apart = d.len() / PAIRS;
-        let part = &mut part[..POINTS * band];
+        let room = &mut room[..POINTS * band];
         let mut first = 0;
         for image in x.chunks_exact_mut(tiles.sizes()[0]) {
             for top in starts {
-                part.fill(T::ZERO);
-                for (i, lines) in part.chunks_exact_mut(band).enumerate() {
+                room.fill(T::ZERO);
+                for (i, lines) in room.chunks_exact_mut(band).enumerate() {
                     for (t, left) in starts.iter().enumerate() {
                         for y in 0..*stride {
                             let block = |j| &d[(i * POINTS + j) * apart + ((first + t) * stride + y) * run..][..run];
@@ -172,7 +172,7 @@ impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
                         }
                     }
                 }
-                let bands = |i| &part[i * band..][..band];
+                let bands = |i| &room[i * band..][..band];
                 let into = parts::<T, POINTS>(&mut image[top * band..][..POINTS * band]);
                 combine_adjoint(simd, [bands(0), bands(1), bands(2), bands(3)], into);
                 first += starts.len();
@@ -186,7 +186,7 @@ struct Leave<'a, T, const KEPT: usize> {
     tiles: &'a Tiles,
     p: &'a [T],
     y: &'a mut [T],
-    part: &'a mut [T],
+    room: &'a mut [T],
 }
 
 impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
@@ -194,10 +194,10 @@ impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, p, y, part } = self;
+        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, p, y, room } = self;
         let apart = p.len() / PAIRS;
         // [m, POINTS, O]
-        let half = &mut part[..KEPT * POINTS * outputs];
+        let half = &mut room[..KEPT * POINTS * outputs];
         let mut tile = 0;
         for image in y.chunks_exact_mut(size * size * outputs) {
             for (top, left) in starts.iter().flat_map(|top| starts.iter().map(move |left| (top, left))) {
@@ -223,7 +223,7 @@ struct LeaveAdjoint<'a, T, const KEPT: usize> {
     tiles: &'a Tiles,
     y: &'a [T],
     p: &'a mut [T],
-    part: &'a mut [T],
+    room: &'a mut [T],
 }
 
 impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
@@ -231,10 +231,10 @@ impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, y, p, part } = self;
+        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, y, p, room } = self;
         let (apart, width) = (p.len() / PAIRS, KEPT * outputs);
         // [POINTS, m, O], and zeros.
-        let (half, nothing) = part.split_at_mut(POINTS * width);
+        let (half, nothing) = room.split_at_mut(POINTS * width);
         nothing[..width].fill(T::ZERO);
         let mut tile = 0;
         for image in y.chunks_exact(size * size * outputs) {
@@ -277,8 +277,8 @@ fn combine_adjoint<S: Simd, T: Real>(simd: S, from: [&[T]; POINTS], d: [&mut [T]
     let [d0, d1, d2, d3] = d;
     for at in (0..d0.len()).step_by(Lanes::<S, T>::COUNT) {
         let mut rest = from;
-        for part in &mut rest {
-            *part = &part[at..];
+        for from in &mut rest {
+            *from = &from[at..];
         }
         let [p0, p1, p2, p3] = Lanes::<S, T>::load_each(simd, rest);
         p0.add_to(&mut d0[at..]);

@@ -10,8 +10,8 @@ use super::real::Real;
 use super::tiles::{BEYOND, ONES, PAIRS, POINTS, Tiles};
 use std::array;
 
-/// Tiles that are multiplied at once, if there are so many: with more of them weights are read less often, with fewer the
-/// products lie nearer.
+/// Of as many images as have so many tiles, those are multiplied at once: with more of them weights are read less often, with
+/// fewer the products lie nearer.
 const AT_ONCE: usize = 64;
 
 /// A convolution over images whose channels lie together, `[S, S, C]`, and a rectified linear unit.
@@ -27,8 +27,8 @@ pub struct Winograd<T> {
 /// Room for what lies between an image and its outputs, kept from image to image.
 #[derive(Debug)]
 pub struct Room<T> {
-    /// What [`Tiles`] needs.
-    part: Aligned<T>,
+    /// What [`Tiles`] works in.
+    tiles: Aligned<T>,
     /// d or d̂, for each pair of points `[tiles, D]`, with [`BEYOND`] numbers behind them.
     d: Aligned<T>,
     /// p or p̂, for each pair of points `[tiles, O]`.
@@ -38,7 +38,7 @@ pub struct Room<T> {
 impl<T: Real> Room<T> {
     /// Empty.
     pub fn new() -> Self {
-        Self { part: zeros(0), d: zeros(0), p: zeros(0) }
+        Self { tiles: zeros(0), d: zeros(0), p: zeros(0) }
     }
 }
 
@@ -55,11 +55,7 @@ impl<T: Real> Winograd<T> {
             return None;
         }
         let tiles = Tiles::new((side, channels), stride, POINTS + 1 - taps, bias.len())?;
-        let tap = |i, j| {
-            let mut tap = Vec::with_capacity(weight.len() / (taps * taps));
-            each_place(&tiles, taps, (i, j), |place| tap.push(weight[place]));
-            tap
-        };
+        let tap = |i, j| places(&tiles, taps, (i, j)).into_iter().map(|place| weight[place]).collect();
         let down: Vec<_> = (0..taps).map(|j| at_points((0..taps).map(|i| tap(i, j)).collect())).collect();
         let across = |i: usize| at_points(down.iter().map(|points| points[i].clone()).collect());
         let bias = |pair| if pair == ONES { bias.to_vec() } else { vec![T::ZERO; bias.len()] };
@@ -70,10 +66,10 @@ impl<T: Real> Winograd<T> {
     /// Images `[R, S, S, C]`, with [`BEYOND`] numbers behind them, to `[R, S', S', O]`.
     pub fn forward(&self, x: &[T], y: &mut [T], room: &mut Room<T>) {
         let [inputs, outputs] = self.tiles.sizes();
-        let images = AT_ONCE.div_ceil(self.tiles.in_image());
+        let images = self.images();
         for (i, y) in y.chunks_mut(images * outputs).enumerate() {
-            let (part, d, p) = self.room(y.len() / outputs, room);
-            self.tiles.enter(&x[i * images * inputs..], d, part);
+            let (inner, d, p) = self.room(y.len() / outputs, room);
+            self.tiles.enter(&x[i * images * inputs..], d, inner);
             for (pair, (layer, (d, p))) in self.layers(d, p).enumerate() {
                 if pair == ONES {
                     layer.forward(d, p);
@@ -81,11 +77,11 @@ impl<T: Real> Winograd<T> {
                     layer.tangent(layer.all(), d, p);
                 }
             }
-            self.tiles.leave(p, y, part);
+            self.tiles.leave(p, y, inner);
         }
     }
 
-    /// Adds to the gradient what ŷ gives, from behind the unit, and writes x̂ if it is asked for.
+    /// Adds to the gradient what ŷ gives, which is a gradient in what the unit takes, and writes x̂ if it is asked for.
     pub fn adjoint(
         &self,
         (x, y_hat): (&[T], &[T]),
@@ -94,13 +90,13 @@ impl<T: Real> Winograd<T> {
         room: &mut Room<T>,
     ) {
         let [inputs, outputs] = self.tiles.sizes();
-        let images = AT_ONCE.div_ceil(self.tiles.in_image());
+        let images = self.images();
         let mut x_hats = x_hat.map(|x_hat| x_hat.chunks_mut(images * inputs));
         for (i, y_hat) in y_hat.chunks(images * outputs).enumerate() {
             let x_hat = x_hats.as_mut().and_then(Iterator::next);
-            let (part, d, p) = self.room(y_hat.len() / outputs, room);
-            self.tiles.enter(&x[i * images * inputs..], d, part);
-            self.tiles.leave_adjoint(y_hat, p, part);
+            let (inner, d, p) = self.room(y_hat.len() / outputs, room);
+            self.tiles.enter(&x[i * images * inputs..], d, inner);
+            self.tiles.leave_adjoint(y_hat, p, inner);
             for (pair, ((layer, (d, p)), gradient)) in self.layers(d, p).zip(&mut *gradient).enumerate() {
                 let biased = if pair == ONES { p.len() / layer.outputs } else { 0 };
                 layer.accumulate(layer.all(), biased, (d, p), gradient);
@@ -110,7 +106,7 @@ impl<T: Real> Winograd<T> {
                 }
             }
             if let Some(x_hat) = x_hat {
-                self.tiles.enter_adjoint(d, x_hat, part);
+                self.tiles.enter_adjoint(d, x_hat, inner);
             }
         }
     }
@@ -125,21 +121,25 @@ impl<T: Real> Winograd<T> {
         let across = |i: usize| in_taps(self.taps, array::from_fn(|j| &gradient[i * POINTS + j].weight[..]));
         let across: [Vec<Vec<T>>; POINTS] = array::from_fn(across);
         let mut weight = vec![T::ZERO; self.taps * self.taps * gradient[ONES].weight.len()];
-        let mut write = |j: usize| {
-            for (i, tap) in in_taps(self.taps, array::from_fn(|i| &across[i][j][..])).into_iter().enumerate() {
-                let mut values = tap.into_iter();
-                each_place(&self.tiles, self.taps, (i, j), |place| weight[place] = values.next().unwrap_or_default());
+        let down = (0..self.taps).map(|j| in_taps(self.taps, array::from_fn(|i| &across[i][j][..])));
+        for (j, taps) in down.enumerate() {
+            for (i, tap) in taps.into_iter().enumerate() {
+                places(&self.tiles, self.taps, (i, j)).into_iter().zip(tap).for_each(|(place, g)| weight[place] = g);
             }
-        };
-        (0..self.taps).for_each(&mut write);
+        }
         [weight, gradient[ONES].bias.to_vec()]
+    }
+
+    /// That go through at once.
+    fn images(&self) -> usize {
+        AT_ONCE.div_ceil(self.tiles.in_image())
     }
 
     fn room<'a>(&self, images: usize, room: &'a mut Room<T>) -> (&'a mut [T], &'a mut [T], &'a mut [T]) {
         let (tiles, layer) = (images * self.tiles.in_image(), &self.points[0]);
-        let part = grown(&mut room.part, self.tiles.part());
+        let inner = grown(&mut room.tiles, self.tiles.room());
         let d = grown(&mut room.d, PAIRS * (tiles * layer.inputs + BEYOND));
-        (part, d, grown(&mut room.p, PAIRS * tiles * layer.outputs))
+        (inner, d, grown(&mut room.p, PAIRS * tiles * layer.outputs))
     }
 
     /// The layers with what belongs to them.
@@ -154,19 +154,19 @@ impl<T: Real> Winograd<T> {
     }
 }
 
-/// Visits where the weights of a tap, `[O, D]`, stand in `[O, C, K, K]`.
-fn each_place(tiles: &Tiles, taps: usize, (i, j): (usize, usize), mut visit: impl FnMut(usize)) {
+/// Where the weights of a tap, `[O, D]`, stand in `[O, C, K, K]`.
+fn places(tiles: &Tiles, taps: usize, (i, j): (usize, usize)) -> Vec<usize> {
     let &Tiles { channels, stride, outputs, .. } = tiles;
     let kernel = taps * stride;
+    let mut places = Vec::with_capacity(outputs * stride * stride * channels);
     for o in 0..outputs {
         for y in i * stride..(i + 1) * stride {
             for x in j * stride..(j + 1) * stride {
-                for c in 0..channels {
-                    visit(((o * channels + c) * kernel + y) * kernel + x);
-                }
+                places.extend((0..channels).map(|c| ((o * channels + c) * kernel + y) * kernel + x));
             }
         }
     }
+    places
 }
 
 /// g(t) = Σ gᵢ tⁱ of two or three taps at each point, halved at 1 and -1; at ∞ it is the last tap.

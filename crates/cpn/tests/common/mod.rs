@@ -73,8 +73,8 @@ pub fn encoders() -> impl Strategy<Value = ImageEncoderConfig> {
     let convolution = (prop_oneof![Just(16i64), Just(32), Just(5)], taps)
         .prop_filter("a valid kernel", |(_, (kernel, _))| *kernel <= 8)
         .prop_map(|(channels, (kernel, stride))| ConvConfig { channels, kernel, stride });
-    proptest::collection::vec(convolution, 1..3)
-        .prop_map(|convolutions| ImageEncoderConfig { convolutions, latent: 6, layer_norm: true })
+    (proptest::collection::vec(convolution, 1..3), any::<bool>())
+        .prop_map(|(convolutions, layer_norm)| ImageEncoderConfig { convolutions, latent: 6, layer_norm })
         .prop_filter("few enough features", |encoder| {
             let side = encoder.convolutions.iter().fold(images::SIZE, |side, c| (side - c.kernel) / c.stride + 1);
             side * side * encoder.convolutions[encoder.convolutions.len() - 1].channels <= FEATURES
