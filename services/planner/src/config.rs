@@ -32,7 +32,8 @@ pub struct Config {
     pub batch_delay_ms: u16,
     /// Threads that plans which are made together are spread over.
     pub threads: NonZeroU16,
-    /// What images are embedded in: bfloat16, where the processor has tiles for it (AMX), is faster for many robots at once, and close.
+    /// What images are embedded in: bfloat16, where the processor has tiles for it (AMX), is faster for many robots at once, and
+    /// close.
     pub precision: Precision,
     /// Where Prometheus finds metrics; none are served if it is not given.
     pub metrics_listen: Option<SocketAddr>,

@@ -63,6 +63,9 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
+    if training.precision.where_faster() != training.precision {
+        info!("training.precision: the processor has no tiles for bfloat16 (AMX); training in float32");
+    }
     info!(tasks = tasks.len(), episodes = dataset.episodes().len(), samples = dataset.sample_count(), "demonstrations");
 
     let mut learner = Learner::new(&recipe, config.seed, config.threads);
