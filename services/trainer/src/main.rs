@@ -37,12 +37,13 @@ async fn main() -> anyhow::Result<()> {
         Command::Train(arguments) => {
             memory::keep()?;
             let config = Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?;
-            if let Some(count) = arguments.demonstrations
-                && !gather(&config, count, &arguments.session).await?
-            {
-                return Ok(());
-            }
-            train(config, arguments.json).await
+            let enough = match arguments.demonstrations {
+                Some(count) => gather(&config, count, &arguments.session).await?,
+                None => true,
+            };
+            let outcome = if enough { train(config, arguments.json).await? } else { Outcome::Interrupted { step: 0 } };
+            tell_outcome(&outcome, arguments.json);
+            Ok(())
         }
         Command::Preset(arguments) => print_preset(&arguments),
         Command::Start(arguments) => start(arguments).await,
@@ -80,7 +81,7 @@ async fn gather(config: &Config, count: usize, network: &SessionConfig) -> anyho
     Ok(enough)
 }
 
-async fn train(config: Config, json: bool) -> anyhow::Result<()> {
+async fn train(config: Config, json: bool) -> anyhow::Result<Outcome> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&stop);
     let mut run = tokio::task::spawn_blocking(move || {
@@ -91,23 +92,25 @@ async fn train(config: Config, json: bool) -> anyhow::Result<()> {
         let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), shown, Box::new(journal)];
         train::run(&config, &mut observers)
     });
-    let outcome = tokio::select! {
-        outcome = &mut run => outcome??,
+    tokio::select! {
+        outcome = &mut run => outcome?,
         signal = shutdown::requested() => {
             signal?;
             stop.store(true, Ordering::Relaxed);
-            run.await??
+            run.await?
         }
-    };
+    }
+}
+
+fn tell_outcome(outcome: &Outcome, json: bool) {
     if json {
         // Nobody may be left to read it.
-        let _ = print_line(&outcome);
+        let _ = print_line(outcome);
     }
     match outcome {
         Outcome::Finished { digest } => tracing::info!(digest, "checkpoint written"),
         Outcome::Interrupted { step } => tracing::info!(step, "interrupted; the same command goes on from here"),
     }
-    Ok(())
 }
 
 fn print_preset(PresetArgs { name }: &PresetArgs) -> anyhow::Result<()> {

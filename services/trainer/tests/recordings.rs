@@ -7,7 +7,9 @@ mod common;
 use common::{episode, files, info, keep, record, sessions, steps};
 use cpn::Input;
 use recording::Episode;
+use rustix::process::{Pid, Signal, kill_process};
 use std::path::Path;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 use trainer::dataset::Dataset;
@@ -67,7 +69,7 @@ async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
     assert_eq!(files(to.path()), files(from.path()));
 }
 
-/// The real process, which is up before the last demonstrations are.
+/// The real process, which is up before the last demonstrations are, and is stopped once before.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_follows_the_stream_until_it_has_enough() {
     let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
@@ -75,33 +77,29 @@ async fn a_run_follows_the_stream_until_it_has_enough() {
     let endpoint = "tcp/127.0.0.1:17474";
     let (trainer, sender) = sessions(endpoint).await;
     let _recorder = record(&trainer, from.path(), Limits::default()).await;
-    let out = to.path().join("live.safetensors");
-    let mut run = tokio::process::Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
-        .args([
-            "train",
-            "--json",
-            "--preset",
-            "paper-bc",
-            "--set",
-            "training.batch_size=8",
-            "--set",
-            "training.epochs=1",
-        ])
-        .args(["--demonstrations", "5", "--connect", endpoint, "--dataset"])
-        .args([&to.path().join("data"), Path::new("--out"), &out, Path::new("--run-dir"), &to.path().join("run")])
-        .kill_on_drop(true)
-        .spawn()
-        .unwrap();
-    let copies = to.path().join("data");
+    let (copies, out) = (to.path().join("data"), to.path().join("live.safetensors"));
+    let start = || {
+        let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_cpn-trainer"));
+        command.args(["train", "--json", "--preset", "paper-bc", "--set", "training.batch_size=8"]);
+        command.args(["--set", "training.epochs=1", "--demonstrations", "5", "--connect", endpoint, "--dataset"]);
+        command.args([&copies, Path::new("--out"), &out, Path::new("--run-dir"), &to.path().join("run")]);
+        command.kill_on_drop(true).stdout(Stdio::piped()).spawn().unwrap()
+    };
+    let stopped = start();
     while !copies.is_dir() || files(&copies) != files(from.path()) {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    assert!(run.try_wait().unwrap().is_none(), "three are not enough");
+    kill_process(Pid::from_raw(stopped.id().unwrap().cast_signed()).unwrap(), Signal::TERM).unwrap();
+    let stopped = stopped.wait_with_output().await.unwrap();
+    assert!(stopped.status.success());
+    let told: serde_json::Value = serde_json::from_slice(&stopped.stdout).unwrap();
+    assert_eq!(told, serde_json::json!({"interrupted": {"step": 0}}), "three are not enough");
+    let run = start();
     for seed in 3..5 {
         replay::send(&sender, &episode("reach", seed, 4)).await.unwrap();
     }
-    let ended = tokio::time::timeout(Duration::from_secs(60), run.wait()).await.expect("the run to end").unwrap();
-    assert!(ended.success());
+    let ended = tokio::time::timeout(Duration::from_secs(60), run.wait_with_output()).await.expect("the run to end");
+    assert!(ended.unwrap().status.success());
     assert_eq!(files(&copies), files(from.path()));
     let trained = cpn::checkpoint::from_bytes(&std::fs::read(out).unwrap()).unwrap().provenance;
     let all = Dataset::load(from.path(), &[], Input::Image).unwrap();
