@@ -4,8 +4,7 @@ use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
 use crate::fused::{Embedded, Embedder, Variables, floats};
-use crate::images;
-use crate::method::Observed;
+use crate::method::Frames;
 use std::collections::HashMap;
 use tch::{Kind, Tensor};
 
@@ -13,7 +12,6 @@ use tch::{Kind, Tensor};
 #[derive(Debug)]
 pub struct FrameEncoder {
     embedder: Embedder<f32>,
-    input: Input,
     precision: Precision,
 }
 
@@ -29,35 +27,23 @@ pub enum WayBack<'a> {
 impl FrameEncoder {
     /// For agents of a valid configuration, on some threads.
     pub fn new(config: &ModelConfig, precision: Precision, threads: usize) -> Self {
-        let input = config.encoder.input();
         // There is little to multiply for a position.
-        let precision = if input == Input::Position { Precision::Float32 } else { precision };
-        Self { embedder: Embedder::new(config.encoder.clone(), threads), input, precision }
+        let precision = if config.encoder.input() == Input::Position { Precision::Float32 } else { precision };
+        Self { embedder: Embedder::new(config.encoder.clone(), threads), precision }
     }
 
-    /// Embeds frames, `[F, 84, 84, 3]` bytes or `[F, 3]` in metres, as `[F, Z]`; `variables` are the agent's.
-    pub fn embed(
-        &mut self,
+    /// Embeds frames as `[F, Z]`; `variables` are the agent's.
+    pub fn embed<'a>(
+        &'a mut self,
         agent: &Agent,
         variables: &HashMap<String, Tensor>,
-        frames: &Tensor,
-    ) -> (Vec<f32>, WayBack<'_>) {
+        frames: &'a Frames,
+    ) -> (Vec<f32>, WayBack<'a>) {
         if self.precision == Precision::Bfloat16 {
-            let embeddings = agent.encoder().encode_in_bfloat16(frames);
+            let embeddings = agent.encoder().encode_in_bfloat16(&frames.tensor());
             return (floats(&embeddings.detach()), WayBack::Autograd(embeddings));
         }
-        let (bytes, metres): (Vec<u8>, Vec<f32>);
-        let frames: Vec<_> = match self.input {
-            Input::Image => {
-                bytes = floats(frames);
-                bytes.chunks_exact(images::BYTES).map(Observed::Image).collect()
-            }
-            Input::Position => {
-                metres = floats(frames);
-                metres.as_chunks().0.iter().copied().map(Observed::Position).collect()
-            }
-        };
-        let (embeddings, embedded) = self.embedder.forward(&Variables(variables), &frames);
+        let (embeddings, embedded) = self.embedder.forward(&Variables(variables), frames.observed());
         (embeddings, WayBack::Fused(embedded))
     }
 }

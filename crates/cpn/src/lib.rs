@@ -39,5 +39,5 @@ pub mod recipe;
 pub use agent::Agent;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
 pub use fused::Planner;
-pub use method::{Method, Plan, Random};
+pub use method::{Frames, Method, Plan, Random};
 pub use recipe::{Preset, Recipe, Training};

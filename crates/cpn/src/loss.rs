@@ -4,6 +4,7 @@ use crate::agent::Agent;
 use crate::embeddings::FrameEncoder;
 use crate::encoder::Precision;
 use crate::fused::{self, OuterLoop, Samples, Variables, floats};
+use crate::method::Frames;
 use std::collections::BTreeMap;
 use std::time::Instant;
 use tch::{Kind, Tensor};
@@ -11,8 +12,8 @@ use tch::{Kind, Tensor};
 /// The tensors of a training step.
 #[derive(Debug)]
 pub struct Batch {
-    /// Every image or position of the batch once, `[F, 84, 84, 3]` bytes or `[F, 3]`.
-    pub frames: Tensor,
+    /// Every image or position of the batch once.
+    pub frames: Frames,
     /// Which frame each sample observes, `[B]` integers.
     pub observations: Tensor,
     /// Which frame is its goal, `[B]` integers.

@@ -1,8 +1,10 @@
 //! The compared methods behind one interface (section "Methods for comparison").
 
 use crate::config::Input;
+use crate::{images, positions};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use tch::Tensor;
 
 /// Anything that turns an observation and a goal into actions. Model predictive control applies the first action of each
 /// plan and plans anew.
@@ -38,6 +40,36 @@ pub enum Observed<'a> {
     Image(&'a [u8]),
     /// x, y, z in metres.
     Position([f32; 3]),
+}
+
+/// Observations and goals, one after the other.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Frames {
+    /// RGB8, `[F, 84, 84, 3]`.
+    Images(Vec<u8>),
+    /// x, y, z in metres, `[F, 3]`.
+    Positions(Vec<[f32; 3]>),
+}
+
+impl Frames {
+    /// Each by itself. What follows the last whole image is left out.
+    pub fn observed(&self) -> Vec<Observed<'_>> {
+        match self {
+            Self::Images(bytes) => bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(),
+            Self::Positions(metres) => metres.iter().copied().map(Observed::Position).collect(),
+        }
+    }
+
+    /// All in one, as [`Encoder::encode`](crate::encoder::Encoder::encode) takes them.
+    ///
+    /// # Panics
+    /// If the bytes are not a whole, non-zero number of images.
+    pub fn tensor(&self) -> Tensor {
+        match self {
+            Self::Images(bytes) => images::from_bytes(bytes).expect("whole images, and at least one"),
+            Self::Positions(metres) => positions::from_metres(metres),
+        }
+    }
 }
 
 /// From where to where.

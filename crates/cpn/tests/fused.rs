@@ -4,11 +4,10 @@
 
 mod common;
 
-use common::{double_agent, encoders, noise_images, position_config, small_config, uniform};
+use common::{double_agent, encoders, frames, noise_images, position_config, small_config, uniform};
 use cpn::config::ConvConfig;
 use cpn::fused::{Embedder, OuterLoop, Samples, Weights};
-use cpn::method::Observed;
-use cpn::{EncoderConfig, Input, MethodKind, ModelConfig, images, loss, positions};
+use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, loss};
 use proptest::prelude::*;
 use std::collections::HashMap;
 use tch::{Kind, Tensor};
@@ -95,19 +94,11 @@ fn gates_in_parts_agree_with_autograd() {
 /// Embeddings, and the gradient of a loss that is linear in them.
 fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
     let agent = double_agent(config.clone());
-    let (bytes, metres): (Vec<u8>, Vec<[f32; 3]>);
-    let (frames, tensor): (Vec<_>, _) = match config.encoder.input() {
-        Input::Image => {
-            let images = noise_images(rows as i64, 5);
-            bytes = Vec::try_from(images.flatten(0, -1)).unwrap();
-            (bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(), images)
-        }
-        Input::Position => {
-            metres = (0..rows).map(|row| [row as f32 / 8.0, 0.3, -0.6]).collect();
-            (metres.iter().copied().map(Observed::Position).collect(), positions::from_metres(&metres))
-        }
+    let frames = match config.encoder.input() {
+        Input::Image => frames(&noise_images(rows as i64, 5)),
+        Input::Position => Frames::Positions((0..rows).map(|row| [row as f32 / 8.0, 0.3, -0.6]).collect()),
     };
-    let reference = agent.encoder().encode(&tensor);
+    let reference = agent.encoder().encode(&frames.tensor());
     let hat = uniform(&reference.size(), 6);
     (&reference * &hat).sum(None::<Kind>).backward();
 
@@ -115,7 +106,7 @@ fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
     let mut embedder = Embedder::<f64>::new(config.encoder.clone(), threads);
     // Again, from what the passes before left.
     for _ in 0..2 {
-        let (embeddings, embedded) = embedder.forward(&variables, &frames);
+        let (embeddings, embedded) = embedder.forward(&variables, frames.observed());
         assert_close(config, "embeddings", &embeddings, &reference);
         let weights = embedded.adjoint(&floats(&hat));
         for (name, ours) in &weights {

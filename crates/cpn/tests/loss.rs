@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{noise_images, uniform};
+use common::{frames, noise_images, uniform};
 use cpn::encoder::Precision;
 use cpn::loss::{Batch, OuterLoss};
 use cpn::{Agent, MethodKind, ModelConfig};
@@ -14,7 +14,7 @@ use tch::{Kind, Tensor};
 fn batch(config: &ModelConfig) -> Batch {
     let mask = uniform(&[8, config.horizon], 4).gt(-0.6).to_kind(Kind::Float);
     Batch {
-        frames: noise_images(7, 1),
+        frames: frames(&noise_images(7, 1)),
         observations: Tensor::from_slice(&[0i64, 1, 2, 3, 4, 0, 5, 5]),
         goals: Tensor::from_slice(&[6i64, 6, 6, 6, 6, 5, 4, 6]),
         actions: uniform(&[8, config.horizon, config.actions], 3).to_kind(Kind::Float),

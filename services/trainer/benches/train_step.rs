@@ -11,7 +11,7 @@ mod common;
 use clap::Parser;
 use cpn::archive::{self, Tensors};
 use cpn::encoder::Precision;
-use cpn::{Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
+use cpn::{Frames, Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
 use serde_json::json;
 use std::io::{self, BufRead};
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Instant;
 use tch::Tensor;
-use trainer::dataset::{Dataset, Frames};
+use trainer::dataset::Dataset;
 use trainer::learner::{Learner, StageTimes};
 use trainer::sampler::Sampler;
 
@@ -93,7 +93,7 @@ fn write(path: &Path, args: &Args) {
     }
     let dataset = Dataset::load(&folder, &[], Input::Image).unwrap();
     let sampler = Sampler::new(&dataset, &recipe, SEED);
-    let Frames::Pixels(pixels) = dataset.frames() else { panic!("expected images") };
+    let Frames::Images(pixels) = dataset.frames() else { panic!("expected images") };
     let samples: Vec<_> =
         (0..).flat_map(|epoch| sampler.epoch(epoch)).take(BATCHES * recipe.training.batch_size).collect();
     let index = |step: fn(&trainer::sampler::Sample) -> u32| {

@@ -3,7 +3,7 @@
 use crate::frame;
 use crate::recordings::{self, dataset_digest};
 use anyhow::{Context, ensure};
-use cpn::{Input, images};
+use cpn::{Frames, Input, images};
 use rayon::prelude::*;
 use recording::Episode as Recording;
 use std::collections::BTreeSet;
@@ -14,6 +14,7 @@ use wire::demonstration::RecordedEpisode;
 /// Every frame and action of every episode that is not held out.
 #[derive(Debug)]
 pub struct Dataset {
+    /// Episode after episode; of positions the last of each is where the hand was to go, which is only ever a goal.
     frames: Frames,
     /// `[actions, A]`, episode after episode.
     actions: Vec<f32>,
@@ -21,15 +22,6 @@ pub struct Dataset {
     episodes: Vec<Episode>,
     infos: Vec<RecordedEpisode>,
     digest: String,
-}
-
-/// What was observed, episode after episode.
-#[derive(Debug)]
-pub enum Frames {
-    /// Camera images, `[frames, 84, 84, 3]`.
-    Pixels(Vec<u8>),
-    /// Positions of the hand, in metres. The last of an episode is where it was to go, which is only ever a goal.
-    Positions(Vec<[f32; 3]>),
 }
 
 /// Where an episode lies: T actions, and T + 1 frames before, between and after them.
@@ -77,7 +69,7 @@ impl Dataset {
             Input::Image => {
                 let mut pixels = vec![0; count * images::BYTES];
                 let read = fill(slots(&mut pixels, images::BYTES, &episodes), folder, &paths, copy_pixels)?;
-                (Frames::Pixels(pixels), read)
+                (Frames::Images(pixels), read)
             }
             Input::Position => {
                 let mut positions = vec![[0.0; 3]; count];
@@ -106,7 +98,7 @@ impl Dataset {
     /// How every frame was rendered; empty for those of a real camera and for positions.
     pub fn render_spec(&self) -> &str {
         match self.frames {
-            Frames::Pixels(_) => &self.infos[0].render_spec,
+            Frames::Images(_) => &self.infos[0].render_spec,
             Frames::Positions(_) => "",
         }
     }

@@ -1,10 +1,10 @@
 //! Which samples a training run sees, in which order, towards which goals: a function of the data, the recipe and the seed.
 
 use crate::augment::Look;
-use crate::dataset::{Dataset, Episode, Frames};
+use crate::dataset::{Dataset, Episode};
 use cpn::loss::Batch;
 use cpn::recipe::{GoalSampling, Recipe, Training};
-use cpn::{images, positions};
+use cpn::{Frames, images};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -127,20 +127,18 @@ impl<'a> Sampler<'a> {
     }
 
     /// Some frames, each of an episode and at an index among all, as the encoder takes them.
-    fn frames(&self, step: u64, frames: &[(u32, usize)]) -> Tensor {
+    fn frames(&self, step: u64, frames: &[(u32, usize)]) -> Frames {
         match self.dataset.frames() {
-            Frames::Pixels(pixels) => {
+            Frames::Images(pixels) => {
                 let (mut looks, mut changed) = (HashMap::new(), Vec::with_capacity(frames.len() * images::BYTES));
                 for &(episode, index) in frames {
                     let draw = || Look::draw(self.training, self.seed, step, episode);
                     let frame = &pixels[index * images::BYTES..][..images::BYTES];
                     looks.entry(episode).or_insert_with(draw).append(frame, &mut changed);
                 }
-                images::from_bytes(&changed).expect("whole frames, and at least one")
+                Frames::Images(changed)
             }
-            Frames::Positions(all) => {
-                positions::from_metres(&frames.iter().map(|&(_, index)| all[index]).collect::<Vec<_>>())
-            }
+            Frames::Positions(all) => Frames::Positions(frames.iter().map(|&(_, index)| all[index]).collect()),
         }
     }
 

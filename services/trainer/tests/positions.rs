@@ -6,7 +6,7 @@ mod common;
 
 use common::{episode, info, keep, steps};
 use cpn::recipe::GoalSampling;
-use cpn::{Agent, Input, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
+use cpn::{Agent, Frames, Input, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
 use recording::Episode;
 use std::path::Path;
 use tch::Tensor;
@@ -90,12 +90,11 @@ fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() 
         let sampler = Sampler::new(&dataset, &recipe, 0);
         let samples = sampler.epoch(0);
         let batch = sampler.batch(0, &samples);
+        let Frames::Positions(frames) = &batch.frames else { panic!("positions") };
         assert_eq!(samples.len(), STARTS.len() * ACTIONS as usize);
         assert_eq!(samples.iter().all(|sample| sample.goal == ACTIONS), goals == GoalSampling::Final);
         for (row, sample) in samples.iter().enumerate() {
-            let at = |index: &Tensor| -> Vec<f32> {
-                Vec::try_from(batch.frames.get(index.int64_value(&[row as i64]))).unwrap()
-            };
+            let at = |index: &Tensor| frames[index.int64_value(&[row as i64]) as usize];
             let start = STARTS[sample.episode as usize];
             assert_eq!(at(&batch.observations), hand(start, sample.step));
             let expected = if sample.goal == ACTIONS { GOAL } else { hand(start, sample.goal) };

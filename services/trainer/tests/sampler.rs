@@ -5,6 +5,7 @@
 mod common;
 
 use common::{episode, keep, step};
+use cpn::method::Observed;
 use cpn::recipe::GoalSampling;
 use cpn::{Input, ModelConfig, Preset, Recipe, Training};
 use std::collections::{BTreeMap, BTreeSet};
@@ -79,15 +80,16 @@ fn a_batch_is_what_was_recorded() {
         let sampler = Sampler::new(&dataset, &recipe, 3);
         let samples = sampler.epoch(0);
         let batch = sampler.batch(0, &samples);
-        let frames = batch.frames.size()[0];
+        let frames = batch.frames.observed();
         let distinct: BTreeSet<_> = samples.iter().flat_map(|s| [(s.episode, s.step), (s.episode, s.goal)]).collect();
-        assert_eq!(frames, distinct.len() as i64, "each frame once");
+        assert_eq!(frames.len(), distinct.len(), "each frame once");
         let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
         for (row, s) in samples.iter().enumerate() {
             let recorded = |number| step("reach", s.episode.into(), STEPS[s.episode as usize], number);
             for (index, number) in [(&batch.observations, s.step), (&batch.goals, s.goal)] {
-                let frame = batch.frames.get(index.int64_value(&[row as i64]));
-                let pixels: Vec<u8> = Vec::try_from(frame.flatten(0, -1)).unwrap();
+                let Observed::Image(pixels) = frames[index.int64_value(&[row as i64]) as usize] else {
+                    panic!("an image")
+                };
                 assert_eq!(pixels, recorded(number).frame.data());
             }
             for t in 0..horizon {
@@ -115,7 +117,7 @@ fn drawing_together_saves_frames() {
             *counts.entry(s.episode).or_insert(0) += 1;
             counts
         });
-        (sampler.batch(0, &sampler.epoch(0)[..8]).frames.size()[0], by_episode.len())
+        (sampler.batch(0, &sampler.epoch(0)[..8]).frames.observed().len(), by_episode.len())
     };
     let (frames, episodes) = frames(8);
     assert_eq!((frames, episodes), (9, 1));

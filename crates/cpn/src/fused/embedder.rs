@@ -20,6 +20,7 @@ pub struct Embedder<T> {
 #[derive(Debug)]
 pub struct Embedded<'a, T> {
     encoder: &'a Encoder<T>,
+    frames: Vec<Observed<'a>>,
     /// Frames of a thread.
     share: usize,
     tapes: &'a mut [Tape<T>],
@@ -32,12 +33,16 @@ impl<T: Real> Embedder<T> {
     }
 
     /// Embeds frames, by what the weights are now, as `[F, Z]`.
-    pub fn forward(&mut self, weights: &impl Weights<T>, frames: &[Observed<'_>]) -> (Vec<T>, Embedded<'_, T>) {
+    pub fn forward<'a>(
+        &'a mut self,
+        weights: &impl Weights<T>,
+        frames: Vec<Observed<'a>>,
+    ) -> (Vec<T>, Embedded<'a, T>) {
         let encoder = &*self.encoder.insert(Encoder::new(&self.config, weights));
         let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(INPUTS);
         let parts = self.tapes.par_iter_mut().zip(frames.par_chunks(share));
         let embeddings: Vec<_> = parts.map(|(tape, frames)| encoder.forward(frames, true, tape)).collect();
-        (embeddings.concat(), Embedded { encoder, share, tapes: &mut self.tapes })
+        (embeddings.concat(), Embedded { encoder, frames, share, tapes: &mut self.tapes })
     }
 }
 
@@ -45,12 +50,13 @@ impl<T: Real> Embedded<'_, T> {
     /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name in a checkpoint. The order of its sums
     /// depends on nothing but the frames and the number of threads.
     pub fn adjoint(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {
-        let Self { encoder, share, tapes } = self;
-        let parts = tapes.par_iter_mut().zip(x_hat.par_chunks(share * encoder.latent()));
+        let Self { encoder, frames, share, tapes } = self;
+        let x_hats = x_hat.par_chunks(share * encoder.latent());
+        let parts = tapes.par_iter_mut().zip(frames.par_chunks(share)).zip(x_hats);
         let gradients: Vec<EncoderGradient<T>> = parts
-            .map(|(tape, x_hat)| {
+            .map(|((tape, frames), x_hat)| {
                 let mut gradient = encoder.gradient();
-                encoder.adjoint(x_hat.to_vec(), &mut gradient, tape);
+                encoder.adjoint(frames, x_hat.to_vec(), &mut gradient, tape);
                 gradient
             })
             .collect();

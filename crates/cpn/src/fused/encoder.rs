@@ -15,7 +15,7 @@ use std::mem::swap;
 
 /// Inputs that go through the layers at once: with more of them weights are read less often, with fewer what a layer leaves lies
 /// nearer.
-pub const INPUTS: usize = 4;
+pub const INPUTS: usize = 8;
 
 /// Layers that suit the input, then a linear layer to the embedding.
 #[derive(Debug)]
@@ -53,8 +53,10 @@ pub struct EncoderGradient<T> {
 /// What the forward pass over inputs leaves.
 #[derive(Debug)]
 pub struct Tape<T> {
-    /// For every [`INPUTS`] of them what each layer takes, with [`BEYOND`] numbers behind it.
+    /// For every [`INPUTS`] of them what each layer takes but the first, with [`BEYOND`] numbers behind it.
     groups: Vec<Vec<Aligned<T>>>,
+    /// What the first layer takes: soon made again, and four times as large as the bytes that it is made of.
+    first: Aligned<T>,
     /// `[R, F]`.
     features: Aligned<T>,
     /// What is normalised, `[R, Z]`.
@@ -72,6 +74,7 @@ impl<T: Real> Tape<T> {
     pub fn new() -> Self {
         Self {
             groups: Vec::new(),
+            first: zeros(0),
             features: zeros(0),
             x: Vec::new(),
             convolution: convolution::Room::new(),
@@ -89,9 +92,8 @@ impl<T: Real> Encoder<T> {
             EncoderConfig::Image(config) => of_images(config, weights),
             EncoderConfig::Position(config) => of_positions(config, weights),
         };
-        let linear = Linear::named("encoder.linear", weights);
-        let turned = turn(linear.weight(), channels, linear.inputs / channels);
-        let linear = Linear::new(turned, linear.bias().to_vec());
+        let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.linear.{part}")));
+        let linear = Linear::new(turn(&weight, channels, weight.len() / bias.len() / channels), bias);
         let norm = config.layer_norm().then(|| Norm::named("encoder.norm", weights));
         Self { numbers, layers, channels, linear, norm }
     }
@@ -105,12 +107,12 @@ impl<T: Real> Encoder<T> {
     pub fn forward(&self, inputs: &[Observed<'_>], for_adjoint: bool, tape: &mut Tape<T>) -> Vec<T> {
         let count = if for_adjoint { inputs.len().div_ceil(INPUTS) } else { 1 };
         if tape.groups.len() < count {
-            tape.groups.resize_with(count, || vec![zeros(0); self.layers.len()]);
+            tape.groups.resize_with(count, || vec![zeros(0); self.layers.len().saturating_sub(1)]);
         }
         let features = grown(&mut tape.features, inputs.len() * self.linear.inputs);
         let groups = inputs.chunks(INPUTS).zip(features.chunks_mut(INPUTS * self.linear.inputs));
         for (i, (inputs, features)) in groups.enumerate() {
-            self.features(inputs, features, &mut tape.groups[i % count], &mut tape.convolution);
+            self.features(inputs, features, (&mut tape.first, &mut tape.groups[i % count]), &mut tape.convolution);
         }
         tape.x.resize(inputs.len() * self.latent(), T::ZERO);
         self.linear.forward(features, &mut tape.x);
@@ -120,30 +122,44 @@ impl<T: Real> Encoder<T> {
         }
     }
 
-    /// After a [`Self::forward`] for it: adds to the gradient what a gradient in the embeddings gives, `[R, Z]`.
-    pub fn adjoint(&self, mut hat: Vec<T>, gradient: &mut EncoderGradient<T>, tape: &mut Tape<T>) {
-        let rows = hat.len() / self.latent();
+    /// After a [`Self::forward`] of these inputs for it: adds to the gradient what a gradient in the embeddings gives, `[R, Z]`.
+    pub fn adjoint(
+        &self,
+        inputs: &[Observed<'_>],
+        mut hat: Vec<T>,
+        gradient: &mut EncoderGradient<T>,
+        tape: &mut Tape<T>,
+    ) {
+        let rows = inputs.len();
         if let (Some(norm), Some(gradient)) = (&self.norm, &mut gradient.norm) {
             norm.adjoint(&tape.x, &mut hat, gradient);
         }
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
         let features_hat = grown(&mut tape.features_hat, features.len());
-        features_hat.fill(T::ZERO);
         self.linear.accumulate(self.linear.all(), rows, (features, &hat), &mut gradient.linear);
-        self.linear.backward(self.linear.all(), &hat, features_hat);
-        for (xs, (mut y, y_hat)) in tape.groups.iter().zip(features.chunks(group).zip(features_hat.chunks(group))) {
-            let inputs = y.len() / self.linear.inputs;
+        self.linear.backward(false, self.linear.all(), &hat, features_hat);
+        let (Some((first, layers)), Some((in_first, in_layers))) =
+            (self.layers.split_first(), gradient.layers.split_first_mut())
+        else {
+            return;
+        };
+        let groups = inputs.chunks(INPUTS).zip(&tape.groups);
+        for ((inputs, xs), (mut y, y_hat)) in groups.zip(features.chunks(group).zip(features_hat.chunks(group))) {
+            let rows = inputs.len();
             grown(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
-            let layers = self.layers.iter().zip(xs).zip(&mut gradient.layers);
-            for (l, ((layer, x), gradient)) in layers.enumerate().rev() {
+            for ((layer, x), gradient) in layers.iter().zip(xs).zip(&mut *in_layers).rev() {
                 let y_hat = &mut tape.y_hat[..y.len()];
                 mask(y_hat, y);
-                let x_hat = (l > 0).then(|| grown(&mut tape.x_hat, inputs * layer.inputs()));
-                layer.adjoint((inputs, x, y_hat), x_hat, gradient, &mut tape.convolution);
+                let x_hat = grown(&mut tape.x_hat, rows * layer.inputs());
+                layer.adjoint((rows, x, y_hat), Some(x_hat), gradient, &mut tape.convolution);
                 swap(&mut tape.x_hat, &mut tape.y_hat);
-                y = &x[..inputs * layer.inputs()];
+                y = &x[..rows * layer.inputs()];
             }
+            let y_hat = &mut tape.y_hat[..y.len()];
+            mask(y_hat, y);
+            let x = self.entering(inputs, &mut tape.first);
+            first.adjoint((rows, x, y_hat), None, in_first, &mut tape.convolution);
         }
     }
 
@@ -182,26 +198,25 @@ impl<T: Real> Encoder<T> {
         &self,
         inputs: &[Observed<'_>],
         features: &mut [T],
-        tape: &mut [Aligned<T>],
+        (first, between): (&mut Aligned<T>, &mut [Aligned<T>]),
         room: &mut convolution::Room<T>,
     ) {
-        if self.layers.is_empty() {
-            return self.numbers.write(inputs, features);
-        }
-        let mut rest = tape;
-        for (l, layer) in self.layers.iter().enumerate() {
-            let Some((x, others)) = rest.split_first_mut() else { break };
-            let x = grown(x, inputs.len() * layer.inputs() + BEYOND);
-            if l == 0 {
-                self.numbers.write(inputs, x);
-            }
+        let Some((last, layers)) = self.layers.split_last() else { return self.numbers.write(inputs, features) };
+        let mut x = self.entering(inputs, first);
+        for (layer, y) in layers.iter().zip(between) {
             let size = inputs.len() * layer.outputs();
-            match others.first_mut() {
-                Some(y) => layer.forward(inputs.len(), x, &mut grown(y, size + BEYOND)[..size], room),
-                None => layer.forward(inputs.len(), x, features, room),
-            }
-            rest = others;
+            let y = grown(y, size + BEYOND);
+            layer.forward(inputs.len(), x, &mut y[..size], room);
+            x = y;
         }
+        last.forward(inputs.len(), x, features, room);
+    }
+
+    /// What the first layer takes, with [`BEYOND`] numbers behind it.
+    fn entering<'a>(&self, inputs: &[Observed<'_>], x: &'a mut Aligned<T>) -> &'a [T] {
+        let x = grown(x, inputs.len() * self.layers[0].inputs() + BEYOND);
+        self.numbers.write(inputs, x);
+        x
     }
 }
 
@@ -286,8 +301,7 @@ impl<T: Real> Layer<T> {
             Self::Linear(linear) => {
                 linear.accumulate(linear.all(), rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
                 if let Some(x_hat) = x_hat {
-                    x_hat.fill(T::ZERO);
-                    linear.backward(linear.all(), y_hat, x_hat);
+                    linear.backward(false, linear.all(), y_hat, x_hat);
                 }
             }
         }

@@ -4,7 +4,7 @@
 
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
 use cpn::loss::Batch;
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, images};
+use cpn::{Agent, EncoderConfig, Frames, MethodKind, ModelConfig, images};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -51,12 +51,23 @@ pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
     Tensor::from_slice(&values).view(shape)
 }
 
+/// Images, or positions.
+pub fn frames(tensor: &Tensor) -> Frames {
+    match tensor.kind() {
+        Kind::Uint8 => Frames::Images(Vec::try_from(tensor.flatten(0, -1)).unwrap()),
+        _ => {
+            let metres: Vec<f32> = Vec::try_from(tensor.to_kind(Kind::Float).flatten(0, -1)).unwrap();
+            Frames::Positions(metres.as_chunks().0.to_vec())
+        }
+    }
+}
+
 /// A batch of observations, each with a goal of its own.
 pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Batch {
     let count = observations.size()[0];
     let rows = |first| Tensor::arange_start(first, first + count, (Kind::Int64, Device::Cpu));
     Batch {
-        frames: Tensor::cat(&[observations, goals], 0),
+        frames: frames(&Tensor::cat(&[observations, goals], 0)),
         observations: rows(0),
         goals: rows(count),
         actions: actions.shallow_clone(),
