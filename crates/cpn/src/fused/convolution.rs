@@ -145,8 +145,7 @@ impl<T: Real> Patches<T> {
         let patches = self.copied(x, patches);
         linear.accumulate(linear.all(), starts.len(), (patches, y_hat), gradient);
         let Some(x_hat) = x_hat else { return };
-        patches.fill(T::ZERO);
-        linear.backward(linear.all(), y_hat, patches);
+        linear.backward(false, linear.all(), y_hat, patches);
         x_hat.fill(T::ZERO);
         for (patch, start) in patches.chunks_exact(places.len()).zip(starts) {
             patch.iter().zip(places).for_each(|(number, place)| x_hat[start + place] += *number);

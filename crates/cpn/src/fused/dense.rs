@@ -125,7 +125,7 @@ impl<T: Real> Dense<T> {
         let (x, y_bar) = (&tape.x[..rows * tape.inputs], &tape.y[rows * tape.outputs..2 * rows * tape.outputs]);
         match (self, &mut tape.gates) {
             (Self::Gated(gated), Some(gates)) => gated.backward(rows, (x, y_bar), gates, scratch, x_bar),
-            _ => self.linear().backward(self.linear().all(), y_bar, x_bar),
+            _ => self.linear().backward(true, self.linear().all(), y_bar, x_bar),
         }
     }
 
@@ -156,7 +156,7 @@ impl<T: Real> Dense<T> {
             }
             _ => {
                 self.linear().accumulate(self.linear().all(), rows, (x, y), &mut gradient.linear);
-                self.linear().backward(self.linear().all(), &y[..rows * tape.outputs], x_hat);
+                self.linear().backward(true, self.linear().all(), &y[..rows * tape.outputs], x_hat);
             }
         }
     }

@@ -4,6 +4,7 @@
 use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
+use pulp::{Arch, Simd, WithSimd};
 use std::ops::Range;
 
 /// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁).
@@ -110,17 +111,14 @@ impl<T: Real> Gate<T> {
     /// Adds up h̄ from s̄ of a part, the first of which begins anew.
     pub fn backward(&self, rows: usize, part: &Range<usize>, s_bar: &[T], tape: &mut GateTape<T>) {
         let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
-        if part.start == 0 {
-            h_bar.fill(T::ZERO);
-        }
-        self.output.backward(part.clone(), s_bar, h_bar);
+        self.output.backward(part.start > 0, part.clone(), s_bar, h_bar);
     }
 
     /// After every [`Self::backward`]: adds to x̄ what h̄ gives.
     pub fn leave_backward(&self, rows: usize, tape: &mut GateTape<T>, x_bar: &mut [T]) {
         let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
         mask(h_bar, &tape.h[..rows * tape.width]);
-        self.hidden.backward(self.hidden.all(), h_bar, x_bar);
+        self.hidden.backward(true, self.hidden.all(), h_bar, x_bar);
     }
 
     /// Adds up ĥ, and adds to the gradient, what `s`, ŝ of a part and in the second order s̄ after it, gives.
@@ -134,11 +132,8 @@ impl<T: Real> Gate<T> {
     ) {
         let stacked = s.len() / part.len() * tape.width;
         let h_hat = &mut tape.h_adjoint[..rows * tape.width];
-        if part.start == 0 {
-            h_hat.fill(T::ZERO);
-        }
         self.output.accumulate(part.clone(), rows, (&tape.h[..stacked], s), &mut gradient.output);
-        self.output.backward(part.clone(), &s[..rows * part.len()], h_hat);
+        self.output.backward(part.start > 0, part.clone(), &s[..rows * part.len()], h_hat);
     }
 
     /// After every [`Self::adjoint`]: adds to x̂, and to the gradient, what ĥ and in the second order h̄ give; `x` holds x and
@@ -154,21 +149,50 @@ impl<T: Real> Gate<T> {
         let (size, stacked) = (rows * tape.width, x.len() / self.hidden.inputs * tape.width);
         let h_hat = &mut tape.h_adjoint[..size];
         mask(h_hat, &tape.h[..size]);
-        self.hidden.backward(self.hidden.all(), h_hat, x_hat);
+        self.hidden.backward(true, self.hidden.all(), h_hat, x_hat);
         self.hidden.accumulate(self.hidden.all(), rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
     }
 }
 
 /// relu(x), in place. What is not a number stays so, for somebody to see.
 pub fn rectify<T: Real>(x: &mut [T]) {
-    for x in x {
-        *x = if *x < T::ZERO { T::ZERO } else { *x };
-    }
+    Arch::new().dispatch(Rectify { x });
 }
 
 /// The derivative of [`rectify`] times `x`, where `rectified` is what it left.
 pub fn mask<T: Real>(x: &mut [T], rectified: &[T]) {
-    for (x, rectified) in x.iter_mut().zip(rectified) {
-        *x = if *rectified > T::ZERO { *x } else { T::ZERO };
+    Arch::new().dispatch(Mask { x, rectified });
+}
+
+#[derive(Debug)]
+struct Rectify<'a, T> {
+    x: &'a mut [T],
+}
+
+impl<T: Real> WithSimd for Rectify<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        for x in self.x {
+            *x = if *x < T::ZERO { T::ZERO } else { *x };
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Mask<'a, T> {
+    x: &'a mut [T],
+    rectified: &'a [T],
+}
+
+impl<T: Real> WithSimd for Mask<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        for (x, rectified) in self.x.iter_mut().zip(self.rectified) {
+            *x = if *rectified > T::ZERO { *x } else { T::ZERO };
+        }
     }
 }

@@ -55,7 +55,7 @@ impl<T: Real> Linear<T> {
 
     /// The fewest outputs of which a multiple may be computed without the others.
     pub fn granule(&self) -> usize {
-        self.transposed.width()
+        Panels::<T>::width()
     }
 
     /// b `[outputs]`.
@@ -81,10 +81,10 @@ impl<T: Real> Linear<T> {
         multiply(false, y_dot, Left::Rows(x_dot), self.transposed.matrix(outputs));
     }
 
-    /// x̄ += aᵀ ȳ: how a loss changes with x, from how it changes with some outputs.
-    pub fn backward(&self, outputs: Range<usize>, y_bar: &[T], x_bar: &mut [T]) {
+    /// x̄ = aᵀ ȳ, added to what is in x̄ if `accumulate`: how a loss changes with x, from how it changes with some outputs.
+    pub fn backward(&self, accumulate: bool, outputs: Range<usize>, y_bar: &[T], x_bar: &mut [T]) {
         let weight = &self.weight[outputs.start * self.inputs..outputs.end * self.inputs];
-        multiply(true, x_bar, Left::Rows(y_bar), Matrix::new(weight, self.inputs));
+        multiply(accumulate, x_bar, Left::Rows(y_bar), Matrix::new(weight, self.inputs));
     }
 
     /// Adds ∂Φ/∂a and ∂Φ/∂b to `gradient`, for Φ = ŷᵀy + ȳᵀẏ over some outputs. `x` and `y` hold the R rows of x and ŷ and,

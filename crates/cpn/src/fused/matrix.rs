@@ -8,6 +8,8 @@ use std::ops::Range;
 
 /// Registers side by side in a panel.
 pub const REGISTERS: usize = 2;
+/// Where three leave less of the last panel empty, and there are enough.
+pub const MORE_REGISTERS: usize = 3;
 
 /// b of a product, `[inner, columns]`, in panels of as many columns as fill some registers.
 #[derive(Debug, Clone, Copy)]
@@ -17,8 +19,10 @@ pub struct Matrix<'a, T> {
     pub columns: usize,
     /// From a row of a panel to the next.
     pub stride: usize,
-    /// From a panel to the next.
-    pub apart: usize,
+    /// Registers of a panel.
+    pub side_by_side: usize,
+    /// Whether it is laid out panel by panel, and not row by row.
+    pub in_panels: bool,
     /// Rows whose panels all go on to their ends, into the next row or not; past b's end there may be nothing to fill the
     /// registers with.
     pub whole: usize,
@@ -27,10 +31,20 @@ pub struct Matrix<'a, T> {
 impl<'a, T: Real> Matrix<'a, T> {
     /// `[inner, columns]`, row by row.
     pub fn new(values: &'a [T], columns: usize) -> Self {
-        let (inner, width) = (values.len() / columns, Shape::of::<T>().width);
-        let beyond = columns.next_multiple_of(width) - columns;
-        let whole = if columns < width { 0 } else { inner.saturating_sub(beyond.div_ceil(columns)) };
-        Self { values, inner, columns, stride: columns, apart: width, whole }
+        let (inner, shape) = (values.len() / columns, Shape::of::<T>());
+        let end = |side_by_side| columns.next_multiple_of(side_by_side * shape.lanes);
+        let more = shape.registers >= 32 && end(MORE_REGISTERS) < end(REGISTERS);
+        let side_by_side = if more { MORE_REGISTERS } else { REGISTERS };
+        // A row by itself takes panels of the fewer registers all the same, which end behind the others.
+        let beyond = (end(REGISTERS) - columns).div_ceil(columns);
+        let whole = if columns < side_by_side * shape.lanes { 0 } else { inner.saturating_sub(beyond) };
+        Self { values, inner, columns, stride: columns, side_by_side, in_panels: false, whole }
+    }
+
+    /// A panel of so many numbers a row, and all that follows it.
+    #[inline(always)]
+    pub fn panel(&self, panel: usize, width: usize) -> &'a [T] {
+        &self.values[panel * if self.in_panels { self.inner * self.stride } else { width }..]
     }
 }
 
@@ -46,12 +60,14 @@ pub struct Panels<T> {
 impl<T: Real> Panels<T> {
     /// Lays out the transpose of `[columns, inner]`.
     pub fn transposed(values: &[T], inner: usize) -> Self {
-        let (columns, width) = (values.len() / inner, Shape::of::<T>().width);
+        let (columns, width) = (values.len() / inner, Self::width());
         let mut panels = zeros(inner * columns.next_multiple_of(width));
         for (panel, rows) in panels.chunks_exact_mut(inner * width).zip(values.chunks(inner * width)) {
-            for (j, row) in rows.chunks_exact(inner).enumerate() {
-                for (k, value) in row.iter().enumerate() {
-                    panel[k * width + j] = *value;
+            // Written from one end to the other; what is read lies in no more lines than a panel has columns.
+            let rows: Vec<_> = rows.chunks_exact(inner).collect();
+            for (k, line) in panel.chunks_exact_mut(width).enumerate() {
+                for (value, row) in line.iter_mut().zip(&rows) {
+                    *value = row[k];
                 }
             }
         }
@@ -59,24 +75,24 @@ impl<T: Real> Panels<T> {
     }
 
     /// Columns of a panel.
-    pub fn width(&self) -> usize {
-        Shape::of::<T>().width
+    pub fn width() -> usize {
+        REGISTERS * Shape::of::<T>().lanes
     }
 
     /// Some columns, from a panel's first on, for a product.
     pub fn matrix(&self, columns: Range<usize>) -> Matrix<'_, T> {
-        let (inner, stride) = (self.inner, self.width());
+        let (inner, stride) = (self.inner, Self::width());
         assert!(columns.start.is_multiple_of(stride) && columns.end <= self.columns, "columns of some panels");
         let values = &self.values[columns.start * inner..];
-        Matrix { values, inner, columns: columns.len(), stride, apart: inner * stride, whole: inner }
+        Matrix { values, inner, columns: columns.len(), stride, side_by_side: REGISTERS, in_panels: true, whole: inner }
     }
 }
 
 /// What suits this processor.
 #[derive(Debug, Clone, Copy)]
 pub struct Shape {
-    /// Of a panel.
-    pub width: usize,
+    /// Numbers in a register.
+    pub lanes: usize,
     /// Registers.
     pub registers: usize,
 }
@@ -89,7 +105,7 @@ impl Shape {
 
             #[inline(always)]
             fn with_simd<S: Simd>(self, _simd: S) -> Shape {
-                Shape { width: REGISTERS * Lanes::<S, T>::COUNT, registers: S::REGISTER_COUNT }
+                Shape { lanes: Lanes::<S, T>::COUNT, registers: S::REGISTER_COUNT }
             }
         }
         Arch::new().dispatch(Ask::<T>(PhantomData))

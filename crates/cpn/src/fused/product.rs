@@ -5,13 +5,13 @@
 //! in their place send it through memory.
 
 use super::lanes::Lanes;
-use super::matrix::{Matrix, REGISTERS, Shape};
+use super::matrix::{MORE_REGISTERS, Matrix, REGISTERS, Shape};
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
 use std::ops::Range;
 
-/// Numbers of the largest tile: eight rows of a panel, or four panels of a row.
-const TILE: usize = 8 * REGISTERS * 16;
+/// Numbers of the largest tile: eight rows of a panel.
+const TILE: usize = 8 * MORE_REGISTERS * 16;
 /// Numbers of a single row that are looked through at once for zeros.
 const CHUNK: usize = 256;
 /// Numbers of b that are read faster than those of a row are looked through.
@@ -41,8 +41,8 @@ pub enum Left<'a, T> {
     Turned(&'a [T]),
 }
 
-/// Sums in registers: of R rows, at P panels.
-type Sums<S, T, const R: usize, const P: usize> = [[[Lanes<S, T>; REGISTERS]; P]; R];
+/// Sums in registers: of R rows, at P panels of W registers.
+type Sums<S, T, const R: usize, const P: usize, const W: usize> = [[[Lanes<S, T>; W]; P]; R];
 
 /// A place along the inner dimension, with b's numbers there from each of P panels on.
 type Place<'a, T, const P: usize> = (usize, [&'a [T]; P]);
@@ -52,24 +52,33 @@ impl<T: Real> Product<'_, T> {
         let (rows, Matrix { inner, columns, .. }) = (self.rows, self.b);
         let (Left::Rows(a) | Left::Turned(a)) = self.a;
         assert!(self.c.len() == rows * columns && a.len() == rows * inner, "shapes of a product");
+        if self.b.side_by_side == MORE_REGISTERS {
+            self.rows::<MORE_REGISTERS>();
+        } else {
+            self.rows::<REGISTERS>();
+        }
+    }
+
+    /// By panels of W registers.
+    fn rows<const W: usize>(&mut self) {
         // As many rows at once as there are registers for their sums, a part of b and a number of a.
         let mut row = 0;
         if Shape::of::<T>().registers >= 32 {
-            row = self.tiles::<8>(row);
+            row = self.tiles::<8, W>(row);
         }
-        row = self.tiles::<6>(row);
-        row = self.tiles::<4>(row);
-        row = self.tiles::<2>(row);
-        for row in row..rows {
+        row = self.tiles::<6, W>(row);
+        row = self.tiles::<4, W>(row);
+        row = self.tiles::<2, W>(row);
+        for row in row..self.rows {
             Arch::new().dispatch(Row { product: self, row });
         }
     }
 
     /// As many rows from `row` on as R divides; answers the row after them.
-    fn tiles<const R: usize>(&mut self, row: usize) -> usize {
+    fn tiles<const R: usize, const W: usize>(&mut self, row: usize) -> usize {
         let end = row + (self.rows - row) / R * R;
         if end > row {
-            Arch::new().dispatch(Tiles::<T, R> { product: self, rows: row..end });
+            Arch::new().dispatch(Tiles::<T, R, W> { product: self, rows: row..end });
         }
         end
     }
@@ -78,16 +87,16 @@ impl<T: Real> Product<'_, T> {
     /// is there. The places are those of whole rows of b, and those where it may end within a register. `room` is for what juts
     /// out over c's right edge.
     #[inline(always)]
-    fn tile<'a, S: Simd, const R: usize, const P: usize>(
+    fn tile<'a, S: Simd, const R: usize, const P: usize, const W: usize>(
         &mut self,
         simd: S,
         (row, panel): (usize, usize),
         first: bool,
         places: [impl Iterator<Item = Place<'a, T, P>>; 2],
-        room: &mut [T; TILE],
+        room: &mut [T],
     ) {
         let (columns, count) = (self.b.columns, Lanes::<S, T>::COUNT);
-        let (at, width) = (panel * REGISTERS * count, P * REGISTERS * count);
+        let (at, width) = (panel * W * count, P * W * count);
         let is_out = columns - at < width;
         let lines = (row..row + R).map(|row| row * columns + at..(row + 1) * columns);
         if is_out {
@@ -96,13 +105,13 @@ impl<T: Real> Product<'_, T> {
             }
         }
         let (c, stride) = if is_out { (&mut room[..], width) } else { (&mut self.c[row * columns + at..], columns) };
-        let mut sums = [[[Lanes::splat(simd, T::ZERO); REGISTERS]; P]; R];
+        let mut sums = [[[Lanes::splat(simd, T::ZERO); W]; P]; R];
         if !first {
             for (r, sums) in sums.iter_mut().enumerate() {
                 let line = &c[r * stride..][..width];
                 for (p, sums) in sums.iter_mut().enumerate() {
                     for (i, sum) in sums.iter_mut().enumerate() {
-                        *sum = Lanes::load(simd, &line[(p * REGISTERS + i) * count..][..count]);
+                        *sum = Lanes::load(simd, &line[(p * W + i) * count..][..count]);
                     }
                 }
             }
@@ -125,27 +134,29 @@ impl<T: Real> Product<'_, T> {
 
 /// R rows at a time.
 #[derive(Debug)]
-struct Tiles<'a, 'b, T, const R: usize> {
+struct Tiles<'a, 'b, T, const R: usize, const W: usize> {
     product: &'a mut Product<'b, T>,
     rows: Range<usize>,
 }
 
-impl<T: Real, const R: usize> WithSimd for Tiles<'_, '_, T, R> {
+impl<T: Real, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, T, R, W> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { product, rows } = self;
         let b = product.b;
-        let mut room = [T::ZERO; TILE];
-        for panel in 0..b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT) {
+        let width = W * Lanes::<S, T>::COUNT;
+        let mut room = beyond(b.columns, width);
+        let room = room.as_mut_slice().as_flattened_mut();
+        for panel in 0..b.columns.div_ceil(width) {
             let lines = |places: Range<usize>| {
-                let values = b.values.get(panel * b.apart + places.start * b.stride..).unwrap_or_default();
+                let values = b.panel(panel, width).get(places.start * b.stride..).unwrap_or_default();
                 places.zip(values.chunks(b.stride)).map(|(k, line)| (k, [line]))
             };
             for row in rows.clone().step_by(R) {
                 let places = [lines(0..b.whole), lines(b.whole..b.inner)];
-                product.tile::<S, R, 1>(simd, (row, panel), !product.accumulate, places, &mut room);
+                product.tile::<S, R, 1, W>(simd, (row, panel), !product.accumulate, places, room);
             }
         }
     }
@@ -164,9 +175,10 @@ impl<T: Real> WithSimd for Row<'_, '_, T> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let Product { a, b: Matrix { inner, whole, columns, .. }, accumulate, .. } = *self.product;
-        let mut room = [T::ZERO; TILE];
+        let mut room = beyond(columns, REGISTERS * Lanes::<S, T>::COUNT);
+        let room = room.as_mut_slice().as_flattened_mut();
         let (Left::Rows(a), SMALL..) = (a, inner * columns) else {
-            return self.panels(simd, !accumulate, [0..whole, whole..inner], &mut room);
+            return self.panels(simd, !accumulate, [0..whole, whole..inner], room);
         };
         let mut places = [0; CHUNK];
         for start in (0..inner).step_by(CHUNK) {
@@ -178,7 +190,7 @@ impl<T: Real> WithSimd for Row<'_, '_, T> {
             }
             let (whole, rest) = places[..count].split_at(places[..count].partition_point(|k| *k < whole));
             let places = [whole.iter().copied(), rest.iter().copied()];
-            self.panels(simd, start == 0 && !accumulate, places, &mut room);
+            self.panels(simd, start == 0 && !accumulate, places, room);
         }
     }
 }
@@ -191,7 +203,7 @@ impl<T: Real> Row<'_, '_, T> {
         simd: S,
         first: bool,
         places: [impl Iterator<Item = usize> + Clone; 2],
-        room: &mut [T; TILE],
+        room: &mut [T],
     ) {
         let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
         let mut panel = 0;
@@ -216,12 +228,12 @@ impl<T: Real> Row<'_, '_, T> {
         panel: usize,
         first: bool,
         [whole, rest]: [impl Iterator<Item = usize>; 2],
-        room: &mut [T; TILE],
+        room: &mut [T],
     ) {
         let b = self.product.b;
         let mut panels = [b.values; P];
         for (p, values) in panels.iter_mut().enumerate() {
-            *values = &b.values[(panel + p) * b.apart..];
+            *values = b.panel(panel + p, REGISTERS * Lanes::<S, T>::COUNT);
         }
         let lines = |k: usize| {
             let mut lines = panels;
@@ -230,18 +242,30 @@ impl<T: Real> Row<'_, '_, T> {
             }
             (k, lines)
         };
-        self.product.tile::<S, 1, P>(simd, (self.row, panel), first, [whole.map(lines), rest.map(lines)], room);
+        self.product.tile::<S, 1, P, REGISTERS>(
+            simd,
+            (self.row, panel),
+            first,
+            [whole.map(lines), rest.map(lines)],
+            room,
+        );
     }
+}
+
+/// Room for a tile that juts out over the right edge, if one can: to fill it with zeros takes its time.
+#[inline(always)]
+fn beyond<T: Real>(columns: usize, width: usize) -> Option<[T; TILE]> {
+    (!columns.is_multiple_of(width)).then(|| [T::ZERO; TILE])
 }
 
 /// Adds to sums what some places along the inner dimension give.
 #[inline(always)]
-fn along<'a, S: Simd, T: Real, const R: usize, const P: usize>(
+fn along<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize>(
     simd: S,
-    mut sums: Sums<S, T, R, P>,
+    mut sums: Sums<S, T, R, P, W>,
     (a, row, count): (Left<'_, T>, usize, usize),
     [whole, rest]: [impl Iterator<Item = Place<'a, T, P>>; 2],
-) -> Sums<S, T, R, P> {
+) -> Sums<S, T, R, P, W> {
     match a {
         Left::Rows(values) => {
             let inner = values.len() / count;
@@ -250,13 +274,13 @@ fn along<'a, S: Simd, T: Real, const R: usize, const P: usize>(
                 *values = &values[(row + r) * inner..][..inner];
             }
             let a = |r: usize, k: usize| rows[r][k];
-            sums = add::<S, T, R, P, true>(simd, sums, whole, a);
-            add::<S, T, R, P, false>(simd, sums, rest, a)
+            sums = add::<S, T, R, P, W, true>(simd, sums, whole, a);
+            add::<S, T, R, P, W, false>(simd, sums, rest, a)
         }
         Left::Turned(values) => {
             let a = |r: usize, k: usize| values[row + k * count..][..R][r];
-            sums = add::<S, T, R, P, true>(simd, sums, whole, a);
-            add::<S, T, R, P, false>(simd, sums, rest, a)
+            sums = add::<S, T, R, P, W, true>(simd, sums, whole, a);
+            add::<S, T, R, P, W, false>(simd, sums, rest, a)
         }
     }
 }
@@ -264,20 +288,20 @@ fn along<'a, S: Simd, T: Real, const R: usize, const P: usize>(
 /// Adds to the sums, for each place, R numbers of a, which `a` answers, times P panels of b, whose rows may end within a
 /// register if they are not WHOLE.
 #[inline(always)]
-fn add<'a, S: Simd, T: Real, const R: usize, const P: usize, const WHOLE: bool>(
+fn add<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize, const WHOLE: bool>(
     simd: S,
-    mut sums: Sums<S, T, R, P>,
+    mut sums: Sums<S, T, R, P, W>,
     places: impl Iterator<Item = Place<'a, T, P>>,
     a: impl Fn(usize, usize) -> T,
-) -> Sums<S, T, R, P> {
+) -> Sums<S, T, R, P, W> {
     let count = Lanes::<S, T>::COUNT;
     for (k, lines) in places {
         for (p, mut line) in lines.into_iter().enumerate() {
             if WHOLE {
-                line = &line[..REGISTERS * count];
+                line = &line[..W * count];
             }
             let part = |i| if WHOLE { &line[i * count..][..count] } else { line.get(i * count..).unwrap_or_default() };
-            let mut b = [Lanes::splat(simd, T::ZERO); REGISTERS];
+            let mut b = [Lanes::splat(simd, T::ZERO); W];
             for (i, b) in b.iter_mut().enumerate() {
                 *b = Lanes::load(simd, part(i));
             }

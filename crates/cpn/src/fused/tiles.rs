@@ -6,7 +6,8 @@
 //! - y₀ = p₀ + p₁ + p₂, then if m = 3 p₁ - p₂, and last p₁ ± p₂ - p₃, with + if m = 3
 //!
 //! A tile does so in both directions. These points need only sums and halves, which cost float32 next to nothing. Each step has
-//! an adjoint, which leads a loss' gradient in what the step gives back to one in what it takes.
+//! an adjoint, which leads a loss' gradient in what the step gives back to one in what it takes. But for the last step, all go
+//! through the points of one direction one after the other, so that what they leave for the products lies near.
 
 use super::lanes::{Lanes, registers, registers_mut};
 use super::real::Real;
@@ -15,6 +16,8 @@ use std::array;
 
 /// 0, 1, -1 and ∞: as many as a tile has blocks in a row.
 pub const POINTS: usize = 4;
+/// What p at each point is made of: the first d, and the second times a sign.
+const COMBINED: [(usize, usize, i8); POINTS] = [(0, 2, -1), (1, 2, 1), (2, 1, -1), (1, 3, -1)];
 /// Of points, one for each direction.
 pub const PAIRS: usize = POINTS * POINTS;
 /// The pair of 1 in both directions.
@@ -60,7 +63,7 @@ impl Tiles {
 
     /// Numbers of the memory that the steps work in.
     pub fn room(&self) -> usize {
-        (POINTS * (self.band() + BEYOND)).max((POINTS + 1) * self.kept * self.outputs)
+        (self.band() + BEYOND).max(POINTS * self.kept * self.outputs)
     }
 
     /// Numbers of a block's part of a line.
@@ -78,15 +81,15 @@ impl Tiles {
         self.stride * self.line()
     }
 
-    /// From images to d, combined in both directions: for each pair of points `[tiles, D]`, with [`BEYOND`] numbers behind both.
-    pub fn enter<T: Real>(&self, x: &[T], d: &mut [T], room: &mut [T]) {
-        Arch::new().dispatch(Enter { tiles: self, x, d, room });
+    /// From images to d, combined in both directions, down at one point: for each across `[tiles, D]`, with [`BEYOND`] numbers
+    /// behind it and behind the images.
+    pub fn enter<T: Real>(&self, point: usize, x: &[T], d: &mut [T], room: &mut [T]) {
+        Arch::new().dispatch(Enter { tiles: self, point, x, d, room });
     }
 
-    /// Writes x̂ from d̂.
-    pub fn enter_adjoint<T: Real>(&self, d: &[T], x: &mut [T], room: &mut [T]) {
-        x.fill(T::ZERO);
-        Arch::new().dispatch(EnterAdjoint { tiles: self, d, x, room });
+    /// Adds to x̂ what d̂ at a point gives.
+    pub fn enter_adjoint<T: Real>(&self, point: usize, d: &[T], x: &mut [T], room: &mut [T]) {
+        Arch::new().dispatch(EnterAdjoint { tiles: self, point, d, x, room });
     }
 
     /// From p, for each pair of points `[tiles, O]`, to outputs, rectified.
@@ -97,11 +100,11 @@ impl Tiles {
         }
     }
 
-    /// Writes p̂ from ŷ, which is a gradient in what the unit takes.
-    pub fn leave_adjoint<T: Real>(&self, y: &[T], p: &mut [T], room: &mut [T]) {
+    /// Writes p̂, down at one point, from ŷ, which is a gradient in what the unit takes.
+    pub fn leave_adjoint<T: Real>(&self, point: usize, y: &[T], p: &mut [T], room: &mut [T]) {
         match self.kept {
-            2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, y, p, room }),
-            _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, y, p, room }),
+            2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, point, y, p, room }),
+            _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, point, y, p, room }),
         }
     }
 }
@@ -110,6 +113,7 @@ impl Tiles {
 #[derive(Debug)]
 struct Enter<'a, T> {
     tiles: &'a Tiles,
+    point: usize,
     x: &'a [T],
     d: &'a mut [T],
     room: &'a mut [T],
@@ -120,22 +124,19 @@ impl<T: Real> WithSimd for Enter<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: tiles @ Tiles { stride, starts, .. }, x, d, room } = self;
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, point, x, d, room } = self;
         let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
-        let count = (d.len() / PAIRS - BEYOND) / (stride * run);
-        let mut lines = parts::<T, POINTS>(&mut room[..POINTS * (band + BEYOND)]);
-        let mut d = parts::<T, PAIRS>(d);
+        let count = (d.len() / POINTS - BEYOND) / (stride * run);
+        let lines = &mut room[..band + BEYOND];
+        let mut d = parts::<T, POINTS>(d);
         for (row, first) in (0..count).step_by(starts.len()).enumerate() {
             let x = &x[row / starts.len() * tiles.sizes()[0] + starts[row % starts.len()] * band..];
-            let bands = [x, &x[band..], &x[2 * band..], &x[3 * band..]];
-            combine(simd, band, bands, lines.each_mut().map(|lines| &mut lines[..]));
-            for (lines, d) in lines.iter().zip(d.as_chunks_mut::<POINTS>().0) {
-                for (t, left) in starts.iter().enumerate() {
-                    for y in 0..*stride {
-                        let block = |j| &lines[y * line + (left + j) * run..];
-                        let into = d.each_mut().map(|d| &mut d[((first + t) * stride + y) * run..]);
-                        combine(simd, run, [block(0), block(1), block(2), block(3)], into);
-                    }
+            combine_at(simd, point, band, x, lines);
+            for (t, left) in starts.iter().enumerate() {
+                for y in 0..*stride {
+                    let block = |j| &lines[y * line + (left + j) * run..];
+                    let into = d.each_mut().map(|d| &mut d[((first + t) * stride + y) * run..]);
+                    combine(simd, run, [block(0), block(1), block(2), block(3)], into);
                 }
             }
         }
@@ -145,6 +146,7 @@ impl<T: Real> WithSimd for Enter<'_, T> {
 #[derive(Debug)]
 struct EnterAdjoint<'a, T> {
     tiles: &'a Tiles,
+    point: usize,
     d: &'a [T],
     x: &'a mut [T],
     room: &'a mut [T],
@@ -155,26 +157,22 @@ impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: tiles @ Tiles { stride, starts, .. }, d, x, room } = self;
+        let Self { tiles: tiles @ Tiles { stride, starts, .. }, point, d, x, room } = self;
         let (run, line, band) = (tiles.run(), tiles.line(), tiles.band());
-        let apart = d.len() / PAIRS;
-        let room = &mut room[..POINTS * band];
+        let apart = d.len() / POINTS;
+        let lines = &mut room[..band];
         let mut first = 0;
         for image in x.chunks_exact_mut(tiles.sizes()[0]) {
             for top in starts {
-                room.fill(T::ZERO);
-                for (i, lines) in room.chunks_exact_mut(band).enumerate() {
-                    for (t, left) in starts.iter().enumerate() {
-                        for y in 0..*stride {
-                            let block = |j| &d[(i * POINTS + j) * apart + ((first + t) * stride + y) * run..][..run];
-                            let into = parts::<T, POINTS>(&mut lines[y * line + left * run..][..POINTS * run]);
-                            combine_adjoint(simd, [block(0), block(1), block(2), block(3)], into);
-                        }
+                lines.fill(T::ZERO);
+                for (t, left) in starts.iter().enumerate() {
+                    for y in 0..*stride {
+                        let block = |j| &d[j * apart + ((first + t) * stride + y) * run..][..run];
+                        let into = parts::<T, POINTS>(&mut lines[y * line + left * run..][..POINTS * run]);
+                        combine_adjoint(simd, [block(0), block(1), block(2), block(3)], into);
                     }
                 }
-                let bands = |i| &room[i * band..][..band];
-                let into = parts::<T, POINTS>(&mut image[top * band..][..POINTS * band]);
-                combine_adjoint(simd, [bands(0), bands(1), bands(2), bands(3)], into);
+                combine_at_adjoint(simd, point, lines, &mut image[top * band..][..POINTS * band]);
                 first += starts.len();
             }
         }
@@ -221,6 +219,7 @@ impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
 #[derive(Debug)]
 struct LeaveAdjoint<'a, T, const KEPT: usize> {
     tiles: &'a Tiles,
+    point: usize,
     y: &'a [T],
     p: &'a mut [T],
     room: &'a mut [T],
@@ -231,11 +230,12 @@ impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, y, p, room } = self;
-        let (apart, width) = (p.len() / PAIRS, KEPT * outputs);
-        // [POINTS, m, O], and zeros.
-        let (half, nothing) = room.split_at_mut(POINTS * width);
+        let Self { tiles: &Tiles { size, outputs, ref starts, .. }, point, y, p, room } = self;
+        let width = KEPT * outputs;
+        // [m, O], and zeros.
+        let (half, nothing) = room.split_at_mut(width);
         nothing[..width].fill(T::ZERO);
+        let mut p = parts::<T, POINTS>(p);
         let mut tile = 0;
         for image in y.chunks_exact(size * size * outputs) {
             for (down, top) in starts.iter().enumerate() {
@@ -243,12 +243,10 @@ impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
                     // What a tile has in common with the one before counts there alone.
                     let (above, before) = (down * KEPT - top, across * KEPT - left);
                     let row = |i| if i < above { &*nothing } else { &image[((top + i) * size + left) * outputs..] };
-                    keep_adjoint(simd, width, array::from_fn::<_, KEPT, _>(row), parts::<T, POINTS>(half));
-                    for (half, p) in half.chunks_exact(width).zip(p.chunks_exact_mut(POINTS * apart)) {
-                        let column = |j| if j < before { &*nothing } else { &half[j * outputs..] };
-                        let into = parts::<T, POINTS>(p).map(|p| &mut p[tile * outputs..]);
-                        keep_adjoint(simd, outputs, array::from_fn::<_, KEPT, _>(column), into);
-                    }
+                    keep_at_adjoint(simd, point, width, array::from_fn::<_, KEPT, _>(row), half);
+                    let column = |j| if j < before { &*nothing } else { &half[j * outputs..] };
+                    let into = p.each_mut().map(|p| &mut p[tile * outputs..]);
+                    keep_adjoint(simd, outputs, array::from_fn::<_, KEPT, _>(column), into);
                     tile += 1;
                 }
             }
@@ -268,6 +266,33 @@ fn combine<S: Simd, T: Real>(simd: S, length: usize, d: [&[T]; POINTS], into: [&
         into[1][i] = (d1 + d2).values();
         into[2][i] = (d2 - d1).values();
         into[3][i] = (d1 - d3).values();
+    }
+}
+
+/// The same at one point alone, of d that lie one after the other.
+#[inline(always)]
+fn combine_at<S: Simd, T: Real>(simd: S, point: usize, length: usize, d: &[T], into: &mut [T]) {
+    let (first, second, sign) = COMBINED[point];
+    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let d = registers(simd, [&d[first * length..], &d[second * length..]], count);
+    let [into] = registers_mut(simd, [into], count);
+    let sign = Lanes::splat(simd, T::from_f64(sign.into()));
+    for i in 0..count {
+        let [first, second] = Lanes::<S, T>::each(simd, [d[0][i], d[1][i]]);
+        into[i] = sign.mul_add(second, first).values();
+    }
+}
+
+/// Adds to d̂, from what the products were made of at one point.
+#[inline(always)]
+fn combine_at_adjoint<S: Simd, T: Real>(simd: S, point: usize, from: &[T], d: &mut [T]) {
+    let (first, second, sign) = COMBINED[point];
+    let d = parts::<T, POINTS>(d);
+    let sign = Lanes::splat(simd, T::from_f64(sign.into()));
+    for at in (0..from.len()).step_by(Lanes::<S, T>::COUNT) {
+        let p = Lanes::load(simd, &from[at..]);
+        p.add_to(&mut d[first][at..]);
+        (sign * p).add_to(&mut d[second][at..]);
     }
 }
 
@@ -329,6 +354,28 @@ fn keep_adjoint<S: Simd, T: Real, const KEPT: usize>(
         into[1][i] = (even + second).values();
         into[2][i] = (even - second).values();
         into[3][i] = (Lanes::splat(simd, T::ZERO) - last).values();
+    }
+}
+
+/// The same at one point alone.
+#[inline(always)]
+fn keep_at_adjoint<S: Simd, T: Real, const KEPT: usize>(
+    simd: S,
+    point: usize,
+    length: usize,
+    y: [&[T]; KEPT],
+    into: &mut [T],
+) {
+    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let y = registers(simd, y, count);
+    let [into] = registers_mut(simd, [into], count);
+    // What p at this point is in the first, the second and the last.
+    let shares = [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, -1.0]][point];
+    let shares = if KEPT == 2 && point != 3 { [shares[0], shares[1], 0.0] } else { shares };
+    let shares = shares.map(|share| Lanes::splat(simd, T::from_f64(share)));
+    for i in 0..count {
+        let [first, second, last] = Lanes::<S, T>::each(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
+        into[i] = shares[2].mul_add(last, shares[1].mul_add(second, shares[0] * first)).values();
     }
 }
 

@@ -29,7 +29,7 @@ pub struct Winograd<T> {
 pub struct Room<T> {
     /// What [`Tiles`] works in.
     tiles: Aligned<T>,
-    /// d or d̂, for each pair of points `[tiles, D]`, with [`BEYOND`] numbers behind them.
+    /// d or d̂, down at one point, for each across `[tiles, D]`, with [`BEYOND`] numbers behind them.
     d: Aligned<T>,
     /// p or p̂, for each pair of points `[tiles, O]`.
     p: Aligned<T>,
@@ -69,12 +69,14 @@ impl<T: Real> Winograd<T> {
         let images = self.images();
         for (i, y) in y.chunks_mut(images * outputs).enumerate() {
             let (inner, d, p) = self.room(y.len() / outputs, room);
-            self.tiles.enter(&x[i * images * inputs..], d, inner);
-            for (pair, (layer, (d, p))) in self.layers(d, p).enumerate() {
-                if pair == ONES {
-                    layer.forward(d, p);
-                } else {
-                    layer.tangent(layer.all(), d, p);
+            for (point, p) in p.chunks_exact_mut(p.len() / POINTS).enumerate() {
+                self.tiles.enter(point, &x[i * images * inputs..], d, inner);
+                for (pair, layer, (d, p)) in self.layers(point, d, p) {
+                    if pair == ONES {
+                        layer.forward(d, p);
+                    } else {
+                        layer.tangent(layer.all(), d, p);
+                    }
                 }
             }
             self.tiles.leave(p, y, inner);
@@ -93,20 +95,25 @@ impl<T: Real> Winograd<T> {
         let images = self.images();
         let mut x_hats = x_hat.map(|x_hat| x_hat.chunks_mut(images * inputs));
         for (i, y_hat) in y_hat.chunks(images * outputs).enumerate() {
-            let x_hat = x_hats.as_mut().and_then(Iterator::next);
-            let (inner, d, p) = self.room(y_hat.len() / outputs, room);
-            self.tiles.enter(&x[i * images * inputs..], d, inner);
-            self.tiles.leave_adjoint(y_hat, p, inner);
-            for (pair, ((layer, (d, p)), gradient)) in self.layers(d, p).zip(&mut *gradient).enumerate() {
-                let biased = if pair == ONES { p.len() / layer.outputs } else { 0 };
-                layer.accumulate(layer.all(), biased, (d, p), gradient);
-                if x_hat.is_some() {
-                    d.fill(T::ZERO);
-                    layer.backward(layer.all(), p, d);
-                }
+            let mut x_hat = x_hats.as_mut().and_then(Iterator::next);
+            if let Some(x_hat) = &mut x_hat {
+                x_hat.fill(T::ZERO);
             }
-            if let Some(x_hat) = x_hat {
-                self.tiles.enter_adjoint(d, x_hat, inner);
+            let (inner, d, p) = self.room(y_hat.len() / outputs, room);
+            let (p, _) = p.split_at_mut(p.len() / POINTS);
+            for point in 0..POINTS {
+                self.tiles.enter(point, &x[i * images * inputs..], d, inner);
+                self.tiles.leave_adjoint(point, y_hat, p, inner);
+                for (pair, layer, (d, p)) in self.layers(point, d, p) {
+                    let biased = if pair == ONES { p.len() / layer.outputs } else { 0 };
+                    layer.accumulate(layer.all(), biased, (d, p), &mut gradient[pair]);
+                    if x_hat.is_some() {
+                        layer.backward(false, layer.all(), p, d);
+                    }
+                }
+                if let Some(x_hat) = &mut x_hat {
+                    self.tiles.enter_adjoint(point, d, x_hat, inner);
+                }
             }
         }
     }
@@ -138,19 +145,21 @@ impl<T: Real> Winograd<T> {
     fn room<'a>(&self, images: usize, room: &'a mut Room<T>) -> (&'a mut [T], &'a mut [T], &'a mut [T]) {
         let (tiles, layer) = (images * self.tiles.in_image(), &self.points[0]);
         let inner = grown(&mut room.tiles, self.tiles.room());
-        let d = grown(&mut room.d, PAIRS * (tiles * layer.inputs + BEYOND));
+        let d = grown(&mut room.d, POINTS * (tiles * layer.inputs + BEYOND));
         (inner, d, grown(&mut room.p, PAIRS * tiles * layer.outputs))
     }
 
-    /// The layers with what belongs to them.
+    /// The layers, down at one point, with what belongs to them, and which of all pairs they are of.
     fn layers<'a>(
         &'a self,
+        point: usize,
         d: &'a mut [T],
         p: &'a mut [T],
-    ) -> impl Iterator<Item = (&'a Linear<T>, (&'a mut [T], &'a mut [T]))> {
-        let (size, apart) = (d.len() / PAIRS - BEYOND, p.len() / PAIRS);
+    ) -> impl Iterator<Item = (usize, &'a Linear<T>, (&'a mut [T], &'a mut [T]))> {
+        let (size, apart) = (d.len() / POINTS - BEYOND, p.len() / POINTS);
         let d = d.chunks_exact_mut(size + BEYOND).map(move |d| &mut d[..size]);
-        self.points.iter().zip(d.zip(p.chunks_exact_mut(apart)))
+        let layers = self.points.iter().enumerate().skip(point * POINTS);
+        layers.zip(d.zip(p.chunks_exact_mut(apart))).map(|((pair, layer), parts)| (pair, layer, parts))
     }
 }
 
