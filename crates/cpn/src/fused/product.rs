@@ -255,7 +255,7 @@ impl<T: Real> Row<'_, '_, T> {
 /// Room for a tile that juts out over the right edge, if one can: to fill it with zeros takes its time.
 #[inline(always)]
 fn beyond<T: Real>(columns: usize, width: usize) -> Option<[T; TILE]> {
-    (!columns.is_multiple_of(width)).then(|| [T::ZERO; TILE])
+    if columns.is_multiple_of(width) { None } else { Some([T::ZERO; TILE]) }
 }
 
 /// Adds to sums what some places along the inner dimension give.
