@@ -45,7 +45,7 @@ struct Args {
     batch: usize,
     #[arg(long, default_value_t = 1)]
     threads: usize,
-    /// Encode in bfloat16, where the processor has tiles for it.
+    /// Encode in bfloat16, where the processor has instructions for it.
     #[arg(long)]
     bfloat16: bool,
     /// What `cargo bench` says.

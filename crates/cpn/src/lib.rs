@@ -25,7 +25,6 @@ pub mod archive;
 pub mod checkpoint;
 pub mod config;
 pub mod dynamics;
-mod embeddings;
 pub mod encoder;
 pub mod fused;
 pub mod images;

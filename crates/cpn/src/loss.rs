@@ -1,9 +1,8 @@
 //! The outer loop: behaviour cloning of the planned actions, through the inner loop.
 
 use crate::agent::Agent;
-use crate::embeddings::FrameEncoder;
 use crate::encoder::Precision;
-use crate::fused::{self, OuterLoop, Samples, Variables, floats};
+use crate::fused::{self, Embedder, OuterLoop, Samples, Variables, floats};
 use crate::method::Frames;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -43,18 +42,18 @@ pub struct Gradient {
     pub encoder_seconds: f64,
 }
 
-/// Differentiates outer losses without a graph ([`crate::fused`]), but for an encoder in bfloat16.
+/// Differentiates outer losses without a graph ([`crate::fused`]).
 #[derive(Debug)]
 pub struct OuterLoss {
-    frames: FrameEncoder,
+    embedder: Embedder<f32>,
     fused: OuterLoop<f32>,
 }
 
 impl OuterLoss {
-    /// For agents like this one, in float32, on some threads.
+    /// For agents like this one, with convolutions of this precision, on some threads.
     pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
         Self {
-            frames: FrameEncoder::new(agent.config(), precision, threads),
+            embedder: Embedder::new(agent.config().encoder.clone(), precision, threads),
             fused: OuterLoop::new(agent.config().clone(), threads),
         }
     }
@@ -64,7 +63,7 @@ impl OuterLoss {
     pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
         let started = Instant::now();
         let variables = agent.variables().variables();
-        let (embeddings, way_back) = self.frames.embed(agent, &variables, &batch.frames);
+        let (embeddings, embedded) = self.embedder.forward(&Variables(&variables), batch.frames.observed());
         let encoding = started.elapsed();
         let latent = agent.config().encoder.latent() as usize;
         let rows = |indices: &Tensor| floats::<i64>(indices).into_iter().map(|row| row as usize * latent);
@@ -81,7 +80,7 @@ impl OuterLoss {
             }
         }
         let started = Instant::now();
-        let in_encoder = way_back.adjoint(&variables, &hat);
+        let in_encoder = embedded.adjoint(&hat);
         Gradient {
             loss: outer.loss.into(),
             weights: outer.weights.into_iter().chain(in_encoder).collect(),

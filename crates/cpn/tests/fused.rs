@@ -6,6 +6,7 @@ mod common;
 
 use common::{double_agent, encoders, frames, noise_images, position_config, small_config, uniform};
 use cpn::config::ConvConfig;
+use cpn::encoder::Precision;
 use cpn::fused::{Embedder, OuterLoop, Samples, Weights};
 use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, loss};
 use proptest::prelude::*;
@@ -103,7 +104,7 @@ fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
     (&reference * &hat).sum(None::<Kind>).backward();
 
     let variables = Named(agent.variables().variables());
-    let mut embedder = Embedder::<f64>::new(config.encoder.clone(), threads);
+    let mut embedder = Embedder::<f64>::new(config.encoder.clone(), Precision::Float32, threads);
     // Again, from what the passes before left.
     for _ in 0..2 {
         let (embeddings, embedded) = embedder.forward(&variables, frames.observed());

@@ -172,13 +172,16 @@ fn embeddings_are_those_of_libtorch() {
     }
 }
 
+/// And, as others, the same in every bit alone or among others.
 #[test]
 fn embeddings_in_bfloat16_are_close() {
     let agent = Agent::new(ModelConfig::paper(MethodKind::Cpn), 0);
     let exact = agent.encode(&noise_images(3, 1));
     let bytes: Vec<u8> = Vec::try_from(noise_images(3, 1).flatten(0, -1)).unwrap();
     let inputs: Vec<_> = bytes.chunks_exact(images::BYTES).map(Observed::Image).collect();
-    for (row, x) in Planner::new(agent, Precision::Bfloat16, 1).encode(&inputs).into_iter().enumerate() {
+    let mut planner = Planner::new(agent, Precision::Bfloat16, 1);
+    for (row, x) in planner.encode(&inputs).into_iter().enumerate() {
+        assert_eq!(planner.encode(&inputs[row..=row]), std::slice::from_ref(&x));
         let error = farthest(&x.into_iter().map(f64::from).collect::<Vec<_>>(), &floats(&exact.get(row as i64)));
         assert!(error > 0.0 && error < 0.1, "{error}: layer-normalised, so that values are about 1");
     }

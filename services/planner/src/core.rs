@@ -41,7 +41,9 @@ impl PlannerCore {
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
         let computing = Computing { precision: config.precision.where_faster(), threads: config.threads };
         if computing.precision != config.precision {
-            warn!("precision: expected a processor with tiles for bfloat16 (AMX), got none; embedding in float32");
+            warn!(
+                "precision: expected a processor with instructions for bfloat16 (AVX512-BF16), got none; embedding in float32"
+            );
         }
         let folder = config.models_dir.clone();
         let models = tokio::task::spawn_blocking(move || load_all(&folder, computing)).await??;

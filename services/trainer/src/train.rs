@@ -64,7 +64,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
     if training.precision.where_faster() != training.precision {
-        info!("training.precision: the processor has no tiles for bfloat16 (AMX); training in float32");
+        info!("training.precision: the processor has no instructions for bfloat16 (AVX512-BF16); training in float32");
     }
     info!(tasks = tasks.len(), episodes = dataset.episodes().len(), samples = dataset.sample_count(), "demonstrations");
 

@@ -5,10 +5,11 @@ use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient};
 use super::real::Real;
 use super::winograd::{self, Winograd};
+use crate::encoder::Precision;
 
 /// Over images whose channels lie together, `[S, S, C]` to `[S', S', O]`.
 #[derive(Debug)]
-pub struct Convolution<T> {
+pub struct Convolution<T: Real> {
     way: Way<T>,
     /// S² C.
     pub inputs: usize,
@@ -17,8 +18,9 @@ pub struct Convolution<T> {
 }
 
 #[derive(Debug)]
-enum Way<T> {
+enum Way<T: Real> {
     Tiles(Winograd<T>),
+    HalfTiles(Winograd<T::Half>),
     Patches(Patches<T>),
 }
 
@@ -37,8 +39,9 @@ struct Patches<T> {
 
 /// Room for what lies between images and outputs, kept from layer to layer.
 #[derive(Debug)]
-pub struct Room<T> {
+pub struct Room<T: Real> {
     tiles: winograd::Room<T>,
+    half_tiles: winograd::Room<T::Half>,
     /// `[S' S', K K C]`.
     patches: Aligned<T>,
 }
@@ -46,16 +49,25 @@ pub struct Room<T> {
 impl<T: Real> Room<T> {
     /// Empty.
     pub fn new() -> Self {
-        Self { tiles: winograd::Room::new(), patches: zeros(0) }
+        Self { tiles: winograd::Room::new(), half_tiles: winograd::Room::new(), patches: zeros(0) }
     }
 }
 
 impl<T: Real> Convolution<T> {
-    /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`.
-    pub fn new((side, channels): (usize, usize), (kernel, stride): (usize, usize), weight: &[T], bias: &[T]) -> Self {
+    /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`; patches are always whole.
+    pub fn new(
+        (side, channels): (usize, usize),
+        (kernel, stride): (usize, usize),
+        (weight, bias): (&[T], &[T]),
+        precision: Precision,
+    ) -> Self {
         let size = (side - kernel) / stride + 1;
-        let way = Winograd::new((side, channels), (kernel, stride), weight, bias)
-            .map_or_else(|| Way::Patches(Patches::new((side, channels), (kernel, stride), weight, bias)), Way::Tiles);
+        let (image, window) = ((side, channels), (kernel, stride));
+        let half = (precision == Precision::Bfloat16).then(|| Winograd::new(image, window, weight, bias)).flatten();
+        let way = half
+            .map(Way::HalfTiles)
+            .or_else(|| Winograd::new(image, window, weight, bias).map(Way::Tiles))
+            .unwrap_or_else(|| Way::Patches(Patches::new(image, window, weight, bias)));
         Self { way, inputs: side * side * channels, outputs: size * size * bias.len() }
     }
 
@@ -63,6 +75,7 @@ impl<T: Real> Convolution<T> {
     pub fn forward(&self, x: &[T], y: &mut [T], room: &mut Room<T>) {
         match &self.way {
             Way::Tiles(tiles) => tiles.forward(x, y, &mut room.tiles),
+            Way::HalfTiles(tiles) => tiles.forward(x, y, &mut room.half_tiles),
             Way::Patches(patches) => {
                 for (x, y) in x.chunks_exact(self.inputs).zip(y.chunks_exact_mut(self.outputs)) {
                     patches.linear.forward(patches.copied(x, &mut room.patches), y);
@@ -82,6 +95,7 @@ impl<T: Real> Convolution<T> {
     ) {
         match &self.way {
             Way::Tiles(tiles) => tiles.adjoint((x, y_hat), x_hat, gradient, &mut room.tiles),
+            Way::HalfTiles(tiles) => tiles.adjoint((x, y_hat), x_hat, gradient, &mut room.half_tiles),
             Way::Patches(patches) => {
                 for (i, (x, y_hat)) in x.chunks_exact(self.inputs).zip(y_hat.chunks_exact(self.outputs)).enumerate() {
                     let x_hat = x_hat.as_mut().map(|x_hat| &mut x_hat[i * self.inputs..][..self.inputs]);
@@ -95,6 +109,7 @@ impl<T: Real> Convolution<T> {
     pub fn gradient(&self) -> Vec<LinearGradient<T>> {
         match &self.way {
             Way::Tiles(tiles) => tiles.gradient(),
+            Way::HalfTiles(tiles) => tiles.gradient(),
             Way::Patches(patches) => vec![patches.linear.gradient()],
         }
     }
@@ -103,6 +118,7 @@ impl<T: Real> Convolution<T> {
     pub fn in_weights(&self, gradient: &[LinearGradient<T>]) -> [Vec<T>; 2] {
         match &self.way {
             Way::Tiles(tiles) => tiles.in_weights(gradient),
+            Way::HalfTiles(tiles) => tiles.in_weights(gradient),
             Way::Patches(Patches { places, channels, .. }) => {
                 let LinearGradient { weight, bias } = &gradient[0];
                 [turn(weight, places.len() / channels, *channels), bias.to_vec()]
@@ -120,7 +136,7 @@ impl<T: Real> Patches<T> {
             starts: starts.collect(),
             places: places.collect(),
             channels,
-            linear: Linear::new(turn(weight, channels, kernel * kernel), bias.to_vec()),
+            linear: Linear::new(&turn(weight, channels, kernel * kernel), bias.to_vec()),
         }
     }
 
@@ -143,7 +159,7 @@ impl<T: Real> Patches<T> {
     ) {
         let Self { starts, places, linear, .. } = self;
         let patches = self.copied(x, patches);
-        linear.accumulate(linear.all(), starts.len(), (patches, y_hat), gradient);
+        linear.accumulate_all(linear.all(), starts.len(), (patches, y_hat), gradient);
         let Some(x_hat) = x_hat else { return };
         linear.backward(false, linear.all(), y_hat, patches);
         x_hat.fill(T::ZERO);

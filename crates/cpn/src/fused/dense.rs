@@ -155,7 +155,7 @@ impl<T: Real> Dense<T> {
                 gated.adjoint(rows, (x, y), gates, scratch, x_hat, (&mut gradient.linear, in_gates));
             }
             _ => {
-                self.linear().accumulate(self.linear().all(), rows, (x, y), &mut gradient.linear);
+                self.linear().accumulate_all(self.linear().all(), rows, (x, y), &mut gradient.linear);
                 self.linear().backward(true, self.linear().all(), &y[..rows * tape.outputs], x_hat);
             }
         }

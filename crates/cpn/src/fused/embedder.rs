@@ -4,13 +4,15 @@ use super::encoder::{Encoder, EncoderGradient, INPUTS, Tape};
 use super::linear::Weights;
 use super::real::Real;
 use crate::config::EncoderConfig;
+use crate::encoder::Precision;
 use crate::method::Observed;
 use rayon::prelude::*;
 
 /// Embeds frames and leads gradients back, on some threads, whose tapes are kept from batch to batch.
 #[derive(Debug)]
-pub struct Embedder<T> {
+pub struct Embedder<T: Real> {
     config: EncoderConfig,
+    precision: Precision,
     /// By the weights of the last forward pass.
     encoder: Option<Encoder<T>>,
     tapes: Vec<Tape<T>>,
@@ -18,7 +20,7 @@ pub struct Embedder<T> {
 
 /// Frames that are embedded, until it is known what a loss changes by with their embeddings.
 #[derive(Debug)]
-pub struct Embedded<'a, T> {
+pub struct Embedded<'a, T: Real> {
     encoder: &'a Encoder<T>,
     frames: Vec<Observed<'a>>,
     /// Frames of a thread.
@@ -28,8 +30,8 @@ pub struct Embedded<'a, T> {
 
 impl<T: Real> Embedder<T> {
     /// For encoders of a valid configuration, on `threads` threads, at least one.
-    pub fn new(config: EncoderConfig, threads: usize) -> Self {
-        Self { config, encoder: None, tapes: (0..threads.max(1)).map(|_| Tape::new()).collect() }
+    pub fn new(config: EncoderConfig, precision: Precision, threads: usize) -> Self {
+        Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| Tape::new()).collect() }
     }
 
     /// Embeds frames, by what the weights are now, as `[F, Z]`.
@@ -38,7 +40,7 @@ impl<T: Real> Embedder<T> {
         weights: &impl Weights<T>,
         frames: Vec<Observed<'a>>,
     ) -> (Vec<T>, Embedded<'a, T>) {
-        let encoder = &*self.encoder.insert(Encoder::new(&self.config, weights));
+        let encoder = &*self.encoder.insert(Encoder::new(&self.config, self.precision, weights));
         let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(INPUTS);
         let parts = self.tapes.par_iter_mut().zip(frames.par_chunks(share));
         let embeddings: Vec<_> = parts.map(|(tape, frames)| encoder.forward(frames, true, tape)).collect();

@@ -8,6 +8,7 @@ use super::norm::Norm;
 use super::real::Real;
 use super::tiles::BEYOND;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
+use crate::encoder::Precision;
 use crate::images::{BYTES, CHANNELS, SIZE};
 use crate::method::Observed;
 use pulp::{Arch, Simd, WithSimd};
@@ -19,7 +20,7 @@ pub const INPUTS: usize = 8;
 
 /// Layers that suit the input, then a linear layer to the embedding.
 #[derive(Debug)]
-pub struct Encoder<T> {
+pub struct Encoder<T: Real> {
     numbers: Numbers<T>,
     layers: Vec<Layer<T>>,
     /// Of the features, which have their channels first in the checkpoint and last here: the weights are turned rather than they.
@@ -37,7 +38,7 @@ enum Numbers<T> {
 
 /// A layer, and the rectified linear unit behind it.
 #[derive(Debug)]
-enum Layer<T> {
+enum Layer<T: Real> {
     Convolution(Convolution<T>),
     Linear(Linear<T>),
 }
@@ -52,7 +53,7 @@ pub struct EncoderGradient<T> {
 
 /// What the forward pass over inputs leaves.
 #[derive(Debug)]
-pub struct Tape<T> {
+pub struct Tape<T: Real> {
     /// For every [`INPUTS`] of them what each layer takes but the first, with [`BEYOND`] numbers behind it.
     groups: Vec<Vec<Aligned<T>>>,
     /// What the first layer takes: soon made again, and four times as large as the bytes that it is made of.
@@ -86,14 +87,14 @@ impl<T: Real> Tape<T> {
 }
 
 impl<T: Real> Encoder<T> {
-    /// Reads the weights of a valid configuration.
-    pub fn new(config: &EncoderConfig, weights: &impl Weights<T>) -> Self {
+    /// Reads the weights of a valid configuration, whose convolutions multiply with this precision.
+    pub fn new(config: &EncoderConfig, precision: Precision, weights: &impl Weights<T>) -> Self {
         let (numbers, layers, channels) = match config {
-            EncoderConfig::Image(config) => of_images(config, weights),
+            EncoderConfig::Image(config) => of_images(config, precision, weights),
             EncoderConfig::Position(config) => of_positions(config, weights),
         };
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.linear.{part}")));
-        let linear = Linear::new(turn(&weight, channels, weight.len() / bias.len() / channels), bias);
+        let linear = Linear::new(&turn(&weight, channels, weight.len() / bias.len() / channels), bias);
         let norm = config.layer_norm().then(|| Norm::named("encoder.norm", weights));
         Self { numbers, layers, channels, linear, norm }
     }
@@ -137,7 +138,7 @@ impl<T: Real> Encoder<T> {
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
         let features_hat = grown(&mut tape.features_hat, features.len());
-        self.linear.accumulate(self.linear.all(), rows, (features, &hat), &mut gradient.linear);
+        self.linear.accumulate_all(self.linear.all(), rows, (features, &hat), &mut gradient.linear);
         self.linear.backward(false, self.linear.all(), &hat, features_hat);
         let (Some((first, layers)), Some((in_first, in_layers))) =
             (self.layers.split_first(), gradient.layers.split_first_mut())
@@ -230,13 +231,22 @@ impl<T: Real> EncoderGradient<T> {
 }
 
 /// The convolutions, with the channels of the last one.
-fn of_images<T: Real>(config: &ImageEncoderConfig, weights: &impl Weights<T>) -> (Numbers<T>, Vec<Layer<T>>, usize) {
+fn of_images<T: Real>(
+    config: &ImageEncoderConfig,
+    precision: Precision,
+    weights: &impl Weights<T>,
+) -> (Numbers<T>, Vec<Layer<T>>, usize) {
     let (mut side, mut channels) = (SIZE as usize, CHANNELS as usize);
     let mut layers = Vec::new();
     for (i, conv) in config.convolutions.iter().enumerate() {
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
         let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
-        layers.push(Layer::Convolution(Convolution::new((side, channels), (kernel, stride), &weight, &bias)));
+        layers.push(Layer::Convolution(Convolution::new(
+            (side, channels),
+            (kernel, stride),
+            (&weight, &bias),
+            precision,
+        )));
         (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
     }
     (Numbers::Pixels, layers, channels)
@@ -299,7 +309,7 @@ impl<T: Real> Layer<T> {
         match self {
             Self::Convolution(convolution) => convolution.adjoint((x, y_hat), x_hat, gradient, room),
             Self::Linear(linear) => {
-                linear.accumulate(linear.all(), rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
+                linear.accumulate_all(linear.all(), rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
                 if let Some(x_hat) = x_hat {
                     linear.backward(false, linear.all(), y_hat, x_hat);
                 }

@@ -132,7 +132,7 @@ impl<T: Real> Gate<T> {
     ) {
         let stacked = s.len() / part.len() * tape.width;
         let h_hat = &mut tape.h_adjoint[..rows * tape.width];
-        self.output.accumulate(part.clone(), rows, (&tape.h[..stacked], s), &mut gradient.output);
+        self.output.accumulate_all(part.clone(), rows, (&tape.h[..stacked], s), &mut gradient.output);
         self.output.backward(part.start > 0, part.clone(), &s[..rows * part.len()], h_hat);
     }
 
@@ -150,7 +150,7 @@ impl<T: Real> Gate<T> {
         let h_hat = &mut tape.h_adjoint[..size];
         mask(h_hat, &tape.h[..size]);
         self.hidden.backward(true, self.hidden.all(), h_hat, x_hat);
-        self.hidden.accumulate(self.hidden.all(), rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
+        self.hidden.accumulate_all(self.hidden.all(), rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
     }
 }
 

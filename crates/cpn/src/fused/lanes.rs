@@ -1,5 +1,6 @@
 //! Numbers side by side in a register of the processor, as wide as it has them.
 
+use super::factor::Factor;
 use super::real::Real;
 use aligned_vec::{AVec, avec};
 use pulp::Simd;
@@ -9,14 +10,14 @@ use std::ops::{Add, Mul, Sub};
 pub type Aligned<T> = AVec<T>;
 
 /// So many zeros.
-pub fn zeros<T: Real>(count: usize) -> Aligned<T> {
-    avec![T::ZERO; count]
+pub fn zeros<E: Factor>(count: usize) -> Aligned<E> {
+    avec![E::ZERO; count]
 }
 
 /// So much of a memory, which grows if it must.
-pub fn grown<T: Real>(memory: &mut Aligned<T>, size: usize) -> &mut [T] {
+pub fn grown<E: Factor>(memory: &mut Aligned<E>, size: usize) -> &mut [E] {
     if memory.len() < size {
-        memory.resize(size, T::ZERO);
+        memory.resize(size, E::ZERO);
     }
     &mut memory[..size]
 }
@@ -112,6 +113,12 @@ impl<S: Simd, T: Real> Lanes<S, T> {
     #[inline(always)]
     pub fn mul_add(self, factor: Self, summand: Self) -> Self {
         Self { values: T::mul_add(self.simd, self.values, factor.values, summand.values), ..self }
+    }
+
+    /// With products of factors added.
+    #[inline(always)]
+    pub fn add_product<E: Factor<Sum = T>>(self, a: E::Lanes<S>, b: E::Lanes<S>) -> Self {
+        Self { values: E::mul_add(self.simd, a, b, self.values), ..self }
     }
 
     /// relu of each. What is not a number stays so, for somebody to see.

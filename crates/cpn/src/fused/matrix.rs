@@ -1,8 +1,8 @@
 //! Matrices as [products](super::product) read them.
 
-use super::lanes::{Aligned, Lanes, zeros};
-use super::real::Real;
-use pulp::{Arch, Simd, WithSimd};
+use super::factor::Factor;
+use super::lanes::{Aligned, zeros};
+use pulp::{Simd, WithSimd};
 use std::marker::PhantomData;
 use std::ops::Range;
 
@@ -13,8 +13,8 @@ pub const MORE_REGISTERS: usize = 3;
 
 /// b of a product, `[inner, columns]`, in panels of as many columns as fill some registers.
 #[derive(Debug, Clone, Copy)]
-pub struct Matrix<'a, T> {
-    pub values: &'a [T],
+pub struct Matrix<'a, E> {
+    pub values: &'a [E],
     pub inner: usize,
     pub columns: usize,
     /// From a row of a panel to the next.
@@ -28,10 +28,10 @@ pub struct Matrix<'a, T> {
     pub whole: usize,
 }
 
-impl<'a, T: Real> Matrix<'a, T> {
+impl<'a, E: Factor> Matrix<'a, E> {
     /// `[inner, columns]`, row by row.
-    pub fn new(values: &'a [T], columns: usize) -> Self {
-        let (inner, shape) = (values.len() / columns, Shape::of::<T>());
+    pub fn new(values: &'a [E], columns: usize) -> Self {
+        let (inner, shape) = (values.len() / columns, Shape::of::<E>());
         let end = |side_by_side| columns.next_multiple_of(side_by_side * shape.lanes);
         let more = shape.registers >= 32 && end(MORE_REGISTERS) < end(REGISTERS);
         let side_by_side = if more { MORE_REGISTERS } else { REGISTERS };
@@ -43,7 +43,7 @@ impl<'a, T: Real> Matrix<'a, T> {
 
     /// A panel of so many numbers a row, and all that follows it.
     #[inline(always)]
-    pub fn panel(&self, panel: usize, width: usize) -> &'a [T] {
+    pub fn panel(&self, panel: usize, width: usize) -> &'a [E] {
         &self.values[panel * if self.in_panels { self.inner * self.stride } else { width }..]
     }
 }
@@ -51,15 +51,15 @@ impl<'a, T: Real> Matrix<'a, T> {
 /// A matrix laid out panel by panel, so that products read it from one end to the other; the last panel is filled up with
 /// zeros.
 #[derive(Debug)]
-pub struct Panels<T> {
-    values: Aligned<T>,
+pub struct Panels<E> {
+    values: Aligned<E>,
     inner: usize,
     columns: usize,
 }
 
-impl<T: Real> Panels<T> {
+impl<E: Factor> Panels<E> {
     /// Lays out the transpose of `[columns, inner]`.
-    pub fn transposed(values: &[T], inner: usize) -> Self {
+    pub fn transposed(values: &[E], inner: usize) -> Self {
         let (columns, width) = (values.len() / inner, Self::width());
         let mut panels = zeros(inner * columns.next_multiple_of(width));
         for (panel, rows) in panels.chunks_exact_mut(inner * width).zip(values.chunks(inner * width)) {
@@ -76,11 +76,11 @@ impl<T: Real> Panels<T> {
 
     /// Columns of a panel.
     pub fn width() -> usize {
-        REGISTERS * Shape::of::<T>().lanes
+        REGISTERS * Shape::of::<E>().lanes
     }
 
     /// Some columns, from a panel's first on, for a product.
-    pub fn matrix(&self, columns: Range<usize>) -> Matrix<'_, T> {
+    pub fn matrix(&self, columns: Range<usize>) -> Matrix<'_, E> {
         let (inner, stride) = (self.inner, Self::width());
         assert!(columns.start.is_multiple_of(stride) && columns.end <= self.columns, "columns of some panels");
         let values = &self.values[columns.start * inner..];
@@ -91,23 +91,23 @@ impl<T: Real> Panels<T> {
 /// What suits this processor.
 #[derive(Debug, Clone, Copy)]
 pub struct Shape {
-    /// Numbers in a register.
+    /// Factors, or sums, in a register.
     pub lanes: usize,
     /// Registers.
     pub registers: usize,
 }
 
 impl Shape {
-    pub fn of<T: Real>() -> Self {
-        struct Ask<T>(PhantomData<T>);
-        impl<T: Real> WithSimd for Ask<T> {
+    pub fn of<E: Factor>() -> Self {
+        struct Ask<E>(PhantomData<E>);
+        impl<E: Factor> WithSimd for Ask<E> {
             type Output = Shape;
 
             #[inline(always)]
             fn with_simd<S: Simd>(self, _simd: S) -> Shape {
-                Shape { lanes: Lanes::<S, T>::COUNT, registers: S::REGISTER_COUNT }
+                Shape { lanes: size_of::<E::Lanes<S>>() / size_of::<E>(), registers: S::REGISTER_COUNT }
             }
         }
-        Arch::new().dispatch(Ask::<T>(PhantomData))
+        E::dispatch(Ask::<E>(PhantomData))
     }
 }

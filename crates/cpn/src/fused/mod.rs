@@ -21,6 +21,7 @@ mod convolution;
 mod dense;
 mod embedder;
 mod encoder;
+mod factor;
 mod gate;
 mod gated;
 mod inner;
@@ -31,6 +32,7 @@ mod modulation;
 mod network;
 mod norm;
 mod outer;
+mod pair;
 mod planner;
 mod product;
 mod real;
@@ -38,7 +40,7 @@ mod sampling;
 mod tiles;
 mod winograd;
 
-pub use embedder::{Embedded, Embedder};
+pub use embedder::Embedder;
 pub use linear::{Weights, add};
 pub use outer::Samples;
 pub use planner::Planner;
@@ -128,6 +130,11 @@ impl<T: Element + Copy> Weights<T> for Variables<'_> {
     fn get(&self, name: &str) -> Vec<T> {
         floats(&self.0[name])
     }
+}
+
+/// Whether bfloat16 is multiplied faster than float32 here.
+pub(crate) fn bfloat16_is_fast() -> bool {
+    pair::Pair::is_fast()
 }
 
 /// A tensor's numbers, row by row.

@@ -1,16 +1,15 @@
 //! Plans without a graph, in memory that is kept from plan to plan.
 
+use super::Variables;
 use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
 use super::linear::Weights;
 use super::network::{Buffers, Network};
 use super::real::Real;
 use super::sampling;
-use super::{Variables, floats};
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
-use crate::images;
 use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
 use rayon::prelude::*;
 
@@ -23,8 +22,6 @@ pub(super) const BLOCK: usize = 16;
 pub struct Planner {
     config: ModelConfig,
     encoder: Encoder<f32>,
-    /// Whose encoder computes in bfloat16, if it is to.
-    half: Option<Agent>,
     dynamics: Dynamics<f32>,
     workers: Vec<Worker<f32>>,
 }
@@ -43,7 +40,7 @@ pub(super) struct Dynamics<T> {
 
 /// One thread's memory.
 #[derive(Debug)]
-pub(super) struct Worker<T> {
+pub(super) struct Worker<T: Real> {
     tape: Tape<T>,
     pub(super) rollout: Rollout<T>,
     pub(super) buffers: Buffers<T>,
@@ -56,18 +53,14 @@ pub(super) struct Worker<T> {
 }
 
 impl Planner {
-    /// Lays out an agent's weights for plans on `threads` threads, at least one.
-    ///
-    /// In bfloat16 images are embedded by libtorch, on its own threads, which is faster for many at once and slower for one;
-    /// an embedding then may differ in its last bits with what else is embedded.
+    /// Lays out an agent's weights for plans on `threads` threads, at least one, with convolutions of this precision.
     pub fn new(agent: Agent, precision: Precision, threads: usize) -> Self {
         let (config, variables) = (agent.config().clone(), agent.variables().variables());
         let weights = &Variables(&variables);
         let dynamics = Dynamics::new(&config, weights);
         let workers = (0..threads.max(1)).map(|_| Worker::new(&dynamics)).collect();
-        let encoder = Encoder::new(&config.encoder, weights);
-        let half = (precision == Precision::Bfloat16 && config.encoder.input() == Input::Image).then_some(agent);
-        Self { encoder, half, dynamics, workers, config }
+        let encoder = Encoder::new(&config.encoder, precision, weights);
+        Self { encoder, dynamics, workers, config }
     }
 }
 
@@ -226,9 +219,6 @@ impl Method for Planner {
 
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         let encoder = &self.encoder;
-        if let Some(agent) = &self.half {
-            return in_bfloat16(agent, inputs);
-        }
         spread(&mut self.workers, inputs, (1, BLOCK), |worker, inputs| {
             let embeddings = encoder.forward(inputs, false, &mut worker.tape);
             embeddings.chunks_exact(encoder.latent()).map(<[f32]>::to_vec).collect()
@@ -251,17 +241,6 @@ impl Method for Planner {
             }
         }
     }
-}
-
-/// Embeds images together.
-fn in_bfloat16(agent: &Agent, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
-    let bytes = inputs.iter().flat_map(|input| match input {
-        Observed::Image(bytes) => *bytes,
-        Observed::Position(_) => panic!("observations are checked as they arrive"),
-    });
-    let images = images::from_bytes(&bytes.copied().collect::<Vec<_>>()).expect("whole images, and at least one");
-    let embeddings = floats::<f32>(&tch::no_grad(|| agent.encoder().encode_in_bfloat16(&images)));
-    embeddings.chunks_exact(embeddings.len() / inputs.len()).map(<[f32]>::to_vec).collect()
 }
 
 /// Runs over blocks of the items, on as many threads as there are workers and `least` items for each; the results in the order

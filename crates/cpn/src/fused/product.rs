@@ -4,10 +4,11 @@
 //! What the kernel keeps in registers is filled in loops of fixed length over slices of fixed length: closures and iterators
 //! in their place send it through memory.
 
+use super::factor::Factor;
 use super::lanes::Lanes;
 use super::matrix::{MORE_REGISTERS, Matrix, REGISTERS, Shape};
 use super::real::Real;
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Simd, WithSimd};
 use std::ops::Range;
 
 /// Numbers of the largest tile: eight rows of a panel.
@@ -18,36 +19,36 @@ const CHUNK: usize = 256;
 const SMALL: usize = 1 << 14;
 
 /// c = a b, added to what is in c if `accumulate`: c is `[rows, columns]`.
-pub fn multiply<T: Real>(accumulate: bool, c: &mut [T], a: Left<'_, T>, b: Matrix<'_, T>) {
+pub fn multiply<E: Factor>(accumulate: bool, c: &mut [E::Sum], a: Left<'_, E>, b: Matrix<'_, E>) {
     let mut product = Product { accumulate, rows: c.len() / b.columns, c, a, b };
     product.run();
 }
 
 #[derive(Debug)]
-struct Product<'a, T> {
+struct Product<'a, E: Factor> {
     accumulate: bool,
     rows: usize,
-    c: &'a mut [T],
-    a: Left<'a, T>,
-    b: Matrix<'a, T>,
+    c: &'a mut [E::Sum],
+    a: Left<'a, E>,
+    b: Matrix<'a, E>,
 }
 
 /// a of a product.
 #[derive(Debug, Clone, Copy)]
-pub enum Left<'a, T> {
+pub enum Left<'a, E> {
     /// `[rows, inner]`.
-    Rows(&'a [T]),
+    Rows(&'a [E]),
     /// `[inner, rows]`.
-    Turned(&'a [T]),
+    Turned(&'a [E]),
 }
 
 /// Sums in registers: of R rows, at P panels of W registers.
 type Sums<S, T, const R: usize, const P: usize, const W: usize> = [[[Lanes<S, T>; W]; P]; R];
 
 /// A place along the inner dimension, with b's numbers there from each of P panels on.
-type Place<'a, T, const P: usize> = (usize, [&'a [T]; P]);
+type Place<'a, E, const P: usize> = (usize, [&'a [E]; P]);
 
-impl<T: Real> Product<'_, T> {
+impl<E: Factor> Product<'_, E> {
     fn run(&mut self) {
         let (rows, Matrix { inner, columns, .. }) = (self.rows, self.b);
         let (Left::Rows(a) | Left::Turned(a)) = self.a;
@@ -63,14 +64,14 @@ impl<T: Real> Product<'_, T> {
     fn rows<const W: usize>(&mut self) {
         // As many rows at once as there are registers for their sums, a part of b and a number of a.
         let mut row = 0;
-        if Shape::of::<T>().registers >= 32 {
+        if Shape::of::<E>().registers >= 32 {
             row = self.tiles::<8, W>(row);
         }
         row = self.tiles::<6, W>(row);
         row = self.tiles::<4, W>(row);
         row = self.tiles::<2, W>(row);
         for row in row..self.rows {
-            Arch::new().dispatch(Row { product: self, row });
+            E::dispatch(Row { product: self, row });
         }
     }
 
@@ -78,7 +79,7 @@ impl<T: Real> Product<'_, T> {
     fn tiles<const R: usize, const W: usize>(&mut self, row: usize) -> usize {
         let end = row + (self.rows - row) / R * R;
         if end > row {
-            Arch::new().dispatch(Tiles::<T, R, W> { product: self, rows: row..end });
+            E::dispatch(Tiles::<E, R, W> { product: self, rows: row..end });
         }
         end
     }
@@ -92,10 +93,10 @@ impl<T: Real> Product<'_, T> {
         simd: S,
         (row, panel): (usize, usize),
         first: bool,
-        places: [impl Iterator<Item = Place<'a, T, P>>; 2],
-        room: &mut [T],
+        places: [impl Iterator<Item = Place<'a, E, P>>; 2],
+        room: &mut [E::Sum],
     ) {
-        let (columns, count) = (self.b.columns, Lanes::<S, T>::COUNT);
+        let (columns, count) = (self.b.columns, Lanes::<S, E::Sum>::COUNT);
         let (at, width) = (panel * W * count, P * W * count);
         let is_out = columns - at < width;
         let lines = (row..row + R).map(|row| row * columns + at..(row + 1) * columns);
@@ -105,7 +106,7 @@ impl<T: Real> Product<'_, T> {
             }
         }
         let (c, stride) = if is_out { (&mut room[..], width) } else { (&mut self.c[row * columns + at..], columns) };
-        let mut sums = [[[Lanes::splat(simd, T::ZERO); W]; P]; R];
+        let mut sums = [[[Lanes::splat(simd, E::Sum::ZERO); W]; P]; R];
         if !first {
             for (r, sums) in sums.iter_mut().enumerate() {
                 let line = &c[r * stride..][..width];
@@ -116,7 +117,7 @@ impl<T: Real> Product<'_, T> {
                 }
             }
         }
-        sums = along(simd, sums, (self.a, row, self.rows), places);
+        sums = along::<S, E, R, P, W>(simd, sums, (self.a, row, self.rows), places);
         for (r, sums) in sums.iter().enumerate() {
             let line = &mut c[r * stride..][..width];
             for (part, sum) in line.chunks_exact_mut(count).zip(sums.as_flattened()) {
@@ -134,19 +135,19 @@ impl<T: Real> Product<'_, T> {
 
 /// R rows at a time.
 #[derive(Debug)]
-struct Tiles<'a, 'b, T, const R: usize, const W: usize> {
-    product: &'a mut Product<'b, T>,
+struct Tiles<'a, 'b, E: Factor, const R: usize, const W: usize> {
+    product: &'a mut Product<'b, E>,
     rows: Range<usize>,
 }
 
-impl<T: Real, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, T, R, W> {
+impl<E: Factor, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, E, R, W> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { product, rows } = self;
         let b = product.b;
-        let width = W * Lanes::<S, T>::COUNT;
+        let width = W * Lanes::<S, E::Sum>::COUNT;
         let mut room = beyond(b.columns, width);
         let room = room.as_mut_slice().as_flattened_mut();
         for panel in 0..b.columns.div_ceil(width) {
@@ -164,18 +165,18 @@ impl<T: Real, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, T, R, W
 
 /// A row by itself, which waits for b to be read; half of it need not be where a is what a rectified linear unit left.
 #[derive(Debug)]
-struct Row<'a, 'b, T> {
-    product: &'a mut Product<'b, T>,
+struct Row<'a, 'b, E: Factor> {
+    product: &'a mut Product<'b, E>,
     row: usize,
 }
 
-impl<T: Real> WithSimd for Row<'_, '_, T> {
+impl<E: Factor> WithSimd for Row<'_, '_, E> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let Product { a, b: Matrix { inner, whole, columns, .. }, accumulate, .. } = *self.product;
-        let mut room = beyond(columns, REGISTERS * Lanes::<S, T>::COUNT);
+        let mut room = beyond(columns, REGISTERS * Lanes::<S, E::Sum>::COUNT);
         let room = room.as_mut_slice().as_flattened_mut();
         let (Left::Rows(a), SMALL..) = (a, inner * columns) else {
             return self.panels(simd, !accumulate, [0..whole, whole..inner], room);
@@ -186,7 +187,7 @@ impl<T: Real> WithSimd for Row<'_, '_, T> {
             let mut count = 0;
             for (k, a) in (start..end).zip(&a[self.row * inner..][start..end]) {
                 places[count] = k;
-                count += usize::from(*a != T::ZERO);
+                count += usize::from(*a != E::ZERO);
             }
             let (whole, rest) = places[..count].split_at(places[..count].partition_point(|k| *k < whole));
             let places = [whole.iter().copied(), rest.iter().copied()];
@@ -195,7 +196,7 @@ impl<T: Real> WithSimd for Row<'_, '_, T> {
     }
 }
 
-impl<T: Real> Row<'_, '_, T> {
+impl<E: Factor> Row<'_, '_, E> {
     /// Several panels at once, so that no sum waits for the one before.
     #[inline(always)]
     fn panels<S: Simd>(
@@ -203,9 +204,9 @@ impl<T: Real> Row<'_, '_, T> {
         simd: S,
         first: bool,
         places: [impl Iterator<Item = usize> + Clone; 2],
-        room: &mut [T],
+        room: &mut [E::Sum],
     ) {
-        let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, T>::COUNT);
+        let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, E::Sum>::COUNT);
         let mut panel = 0;
         while panel + 4 <= panels {
             self.several::<S, 4>(simd, panel, first, places.clone(), room);
@@ -228,12 +229,12 @@ impl<T: Real> Row<'_, '_, T> {
         panel: usize,
         first: bool,
         [whole, rest]: [impl Iterator<Item = usize>; 2],
-        room: &mut [T],
+        room: &mut [E::Sum],
     ) {
         let b = self.product.b;
         let mut panels = [b.values; P];
         for (p, values) in panels.iter_mut().enumerate() {
-            *values = b.panel(panel + p, REGISTERS * Lanes::<S, T>::COUNT);
+            *values = b.panel(panel + p, REGISTERS * Lanes::<S, E::Sum>::COUNT);
         }
         let lines = |k: usize| {
             let mut lines = panels;
@@ -260,12 +261,12 @@ fn beyond<T: Real>(columns: usize, width: usize) -> Option<[T; TILE]> {
 
 /// Adds to sums what some places along the inner dimension give.
 #[inline(always)]
-fn along<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize>(
+fn along<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize>(
     simd: S,
-    mut sums: Sums<S, T, R, P, W>,
-    (a, row, count): (Left<'_, T>, usize, usize),
-    [whole, rest]: [impl Iterator<Item = Place<'a, T, P>>; 2],
-) -> Sums<S, T, R, P, W> {
+    mut sums: Sums<S, E::Sum, R, P, W>,
+    (a, row, count): (Left<'_, E>, usize, usize),
+    [whole, rest]: [impl Iterator<Item = Place<'a, E, P>>; 2],
+) -> Sums<S, E::Sum, R, P, W> {
     match a {
         Left::Rows(values) => {
             let inner = values.len() / count;
@@ -274,13 +275,13 @@ fn along<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize>(
                 *values = &values[(row + r) * inner..][..inner];
             }
             let a = |r: usize, k: usize| rows[r][k];
-            sums = add::<S, T, R, P, W, true>(simd, sums, whole, a);
-            add::<S, T, R, P, W, false>(simd, sums, rest, a)
+            sums = add::<S, E, R, P, W, true>(simd, sums, whole, a);
+            add::<S, E, R, P, W, false>(simd, sums, rest, a)
         }
         Left::Turned(values) => {
             let a = |r: usize, k: usize| values[row + k * count..][..R][r];
-            sums = add::<S, T, R, P, W, true>(simd, sums, whole, a);
-            add::<S, T, R, P, W, false>(simd, sums, rest, a)
+            sums = add::<S, E, R, P, W, true>(simd, sums, whole, a);
+            add::<S, E, R, P, W, false>(simd, sums, rest, a)
         }
     }
 }
@@ -288,27 +289,27 @@ fn along<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize>(
 /// Adds to the sums, for each place, R numbers of a, which `a` answers, times P panels of b, whose rows may end within a
 /// register if they are not WHOLE.
 #[inline(always)]
-fn add<'a, S: Simd, T: Real, const R: usize, const P: usize, const W: usize, const WHOLE: bool>(
+fn add<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize, const WHOLE: bool>(
     simd: S,
-    mut sums: Sums<S, T, R, P, W>,
-    places: impl Iterator<Item = Place<'a, T, P>>,
-    a: impl Fn(usize, usize) -> T,
-) -> Sums<S, T, R, P, W> {
-    let count = Lanes::<S, T>::COUNT;
+    mut sums: Sums<S, E::Sum, R, P, W>,
+    places: impl Iterator<Item = Place<'a, E, P>>,
+    a: impl Fn(usize, usize) -> E,
+) -> Sums<S, E::Sum, R, P, W> {
+    let count = Lanes::<S, E::Sum>::COUNT;
     for (k, lines) in places {
         for (p, mut line) in lines.into_iter().enumerate() {
             if WHOLE {
                 line = &line[..W * count];
             }
             let part = |i| if WHOLE { &line[i * count..][..count] } else { line.get(i * count..).unwrap_or_default() };
-            let mut b = [Lanes::splat(simd, T::ZERO); W];
+            let mut b = [E::splat(simd, E::ZERO); W];
             for (i, b) in b.iter_mut().enumerate() {
-                *b = Lanes::load(simd, part(i));
+                *b = E::load(simd, part(i));
             }
             for (r, sums) in sums.iter_mut().enumerate() {
-                let a = Lanes::splat(simd, a(r, k));
+                let a = E::splat(simd, a(r, k));
                 for (sum, b) in sums[p].iter_mut().zip(b) {
-                    *sum = a.mul_add(b, *sum);
+                    *sum = sum.add_product::<E>(a, b);
                 }
             }
         }

@@ -1,18 +1,16 @@
 //! The numbers that the fused core is written in: float32 to train with, float64 to check it by.
 
+use super::factor::Factor;
+use super::lanes::Aligned;
+use super::pair::Pair;
 use pulp::Simd;
-use std::fmt::Debug;
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
 /// A floating-point number, and registers full of it.
 pub trait Real:
-    Copy
-    + Debug
-    + Default
+    Factor<Sum = Self>
     + PartialOrd
-    + Send
-    + Sync
     + Add<Output = Self>
     + Sub<Output = Self>
     + Mul<Output = Self>
@@ -21,14 +19,11 @@ pub trait Real:
     + AddAssign
     + SubAssign
     + Sum
-    + 'static
 {
-    /// 0.
-    const ZERO: Self;
+    /// What products may multiply in its place, more coarsely.
+    type Half: Factor<Sum = Self>;
     /// 1.
     const ONE: Self;
-    /// A register.
-    type Lanes<S: Simd>: Copy + Debug;
 
     /// A count as a number.
     fn count(n: usize) -> Self;
@@ -43,10 +38,6 @@ pub trait Real:
     /// 1 / (1 + e^-x).
     fn sigmoid(self) -> Self;
 
-    /// The same number everywhere.
-    fn splat<S: Simd>(simd: S, value: Self) -> Self::Lanes<S>;
-    /// The first numbers of a slice; zeros where it ends.
-    fn load<S: Simd>(simd: S, slice: &[Self]) -> Self::Lanes<S>;
     /// Writes over the first numbers of a slice, as many as it has.
     fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: Self::Lanes<S>);
     /// As many whole registers as a slice fills.
@@ -59,8 +50,6 @@ pub trait Real:
     fn sub_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
     /// a b.
     fn mul_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
-    /// a b + c.
-    fn mul_add<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>, c: Self::Lanes<S>) -> Self::Lanes<S>;
     /// The larger of a and b; b where one is not a number.
     fn max_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
     /// The sum of all.
@@ -71,11 +60,9 @@ pub trait Real:
 
 /// What differs between the two kinds only in the names of the library's functions.
 macro_rules! real {
-    ($real:ident, $lanes:ident, $count:ident, $splat:ident, $as_simd:ident, $as_mut_simd:ident, $partial_load:ident, $partial_store:ident, $add:ident, $sub:ident,
-     $mul:ident, $mul_add:ident, $max:ident, $sum:ident) => {
-        const ZERO: Self = 0.0;
+    ($real:ident, $lanes:ident, $count:ident, $as_simd:ident, $as_mut_simd:ident, $partial_store:ident, $add:ident, $sub:ident,
+     $mul:ident, $max:ident, $sum:ident) => {
         const ONE: Self = 1.0;
-        type Lanes<S: Simd> = S::$lanes;
 
         #[inline(always)]
         fn count(n: usize) -> Self {
@@ -105,19 +92,6 @@ macro_rules! real {
         #[inline(always)]
         fn sigmoid(self) -> Self {
             1.0 / (1.0 + (-self).exp())
-        }
-
-        #[inline(always)]
-        fn splat<S: Simd>(simd: S, value: Self) -> S::$lanes {
-            simd.$splat(value)
-        }
-
-        #[inline(always)]
-        fn load<S: Simd>(simd: S, slice: &[Self]) -> S::$lanes {
-            match slice.get(..S::$count).map(S::$as_simd) {
-                Some((&[lanes], _)) => lanes,
-                _ => simd.$partial_load(slice),
-            }
         }
 
         #[inline(always)]
@@ -154,11 +128,6 @@ macro_rules! real {
         }
 
         #[inline(always)]
-        fn mul_add<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes, c: S::$lanes) -> S::$lanes {
-            simd.$mul_add(a, b, c)
-        }
-
-        #[inline(always)]
         fn max_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
             simd.$max(a, b)
         }
@@ -170,20 +139,60 @@ macro_rules! real {
     };
 }
 
+/// A number as it is.
+macro_rules! factor {
+    ($real:ident, $lanes:ident, $count:ident, $splat:ident, $as_simd:ident, $partial_load:ident, $mul_add:ident) => {
+        impl Factor for $real {
+            type Sum = Self;
+            type Lanes<S: Simd> = S::$lanes;
+            const NUMBERS: usize = 1;
+            const ZERO: Self = 0.0;
+
+            #[inline(always)]
+            fn splat<S: Simd>(simd: S, value: Self) -> S::$lanes {
+                simd.$splat(value)
+            }
+
+            #[inline(always)]
+            fn load<S: Simd>(simd: S, slice: &[Self]) -> S::$lanes {
+                match slice.get(..S::$count).map(S::$as_simd) {
+                    Some((&[lanes], _)) => lanes,
+                    _ => simd.$partial_load(slice),
+                }
+            }
+
+            #[inline(always)]
+            fn mul_add<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes, c: S::$lanes) -> S::$lanes {
+                simd.$mul_add(a, b, c)
+            }
+
+            fn along<'a>(numbers: &'a [Self], _: &'a mut Aligned<Self>) -> &'a [Self] {
+                numbers
+            }
+
+            fn across<'a>(numbers: &'a [Self], _: usize, _: &'a mut Aligned<Self>) -> &'a [Self] {
+                numbers
+            }
+        }
+    };
+}
+
+factor!(f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, partial_load_f64s, mul_add_f64s);
+factor!(f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, partial_load_f32s, mul_add_f32s);
+
 impl Real for f64 {
+    /// It is there to check by.
+    type Half = Self;
     real!(
         f64,
         f64s,
         F64_LANES,
-        splat_f64s,
         as_simd_f64s,
         as_mut_simd_f64s,
-        partial_load_f64s,
         partial_store_f64s,
         add_f64s,
         sub_f64s,
         mul_f64s,
-        mul_add_f64s,
         max_f64s,
         reduce_sum_f64s
     );
@@ -198,19 +207,17 @@ impl Real for f64 {
 }
 
 impl Real for f32 {
+    type Half = Pair;
     real!(
         f32,
         f32s,
         F32_LANES,
-        splat_f32s,
         as_simd_f32s,
         as_mut_simd_f32s,
-        partial_load_f32s,
         partial_store_f32s,
         add_f32s,
         sub_f32s,
         mul_f32s,
-        mul_add_f32s,
         max_f32s,
         reduce_sum_f32s
     );

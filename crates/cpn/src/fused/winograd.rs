@@ -4,6 +4,7 @@
 //! [Tiles](super::tiles) of 4 x 4 blocks give m x m outputs, m = 5 - r, by 16 products for each pair of channels, where patches
 //! take 36: each is a linear layer of its own, whose weights are sums of taps.
 
+use super::factor::Factor;
 use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient};
 use super::real::Real;
@@ -14,19 +15,28 @@ use std::array;
 /// fewer the products lie nearer.
 const AT_ONCE: usize = 64;
 
-/// A convolution over images whose channels lie together, `[S, S, C]`, and a rectified linear unit.
+/// A convolution over images whose channels lie together, `[S, S, C]`, and a rectified linear unit; E is what is multiplied.
 #[derive(Debug)]
-pub struct Winograd<T> {
+pub struct Winograd<E: Factor> {
     tiles: Tiles,
     /// r.
     taps: usize,
     /// At each pair of points g, from D = stride² C to O; and at 1 in both directions, which every output has once, the bias.
-    points: Vec<Linear<T>>,
+    points: Vec<Layer<E>>,
 }
+
+type Layer<E> = Linear<E, <E as Factor>::Sum>;
 
 /// Room for what lies between an image and its outputs, kept from image to image.
 #[derive(Debug)]
-pub struct Room<T> {
+pub struct Room<E: Factor> {
+    numbers: Numbers<E::Sum>,
+    /// d and p as factors, if they are not multiplied as they are.
+    factors: [Aligned<E>; 2],
+}
+
+#[derive(Debug)]
+struct Numbers<T> {
     /// What [`Tiles`] works in.
     tiles: Aligned<T>,
     /// d or d̂, down at one point, for each across `[tiles, D]`, with [`BEYOND`] numbers behind them.
@@ -35,14 +45,14 @@ pub struct Room<T> {
     p: Aligned<T>,
 }
 
-impl<T: Real> Room<T> {
+impl<E: Factor> Room<E> {
     /// Empty.
     pub fn new() -> Self {
-        Self { tiles: zeros(0), d: zeros(0), p: zeros(0) }
+        Self { numbers: Numbers { tiles: zeros(0), d: zeros(0), p: zeros(0) }, factors: [zeros(0), zeros(0)] }
     }
 }
 
-impl<T: Real> Winograd<T> {
+impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
     /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`; None where this does not apply.
     pub fn new(
         (side, channels): (usize, usize),
@@ -51,7 +61,8 @@ impl<T: Real> Winograd<T> {
         bias: &[T],
     ) -> Option<Self> {
         let taps = kernel / stride;
-        if kernel != taps * stride || !(2..=3).contains(&taps) || !bias.len().is_multiple_of(BEYOND) {
+        let are_factors = (stride * stride * channels).is_multiple_of(E::NUMBERS);
+        if !are_factors || kernel != taps * stride || !(2..=3).contains(&taps) || !bias.len().is_multiple_of(BEYOND) {
             return None;
         }
         let tiles = Tiles::new((side, channels), stride, POINTS + 1 - taps, bias.len())?;
@@ -59,19 +70,20 @@ impl<T: Real> Winograd<T> {
         let down: Vec<_> = (0..taps).map(|j| at_points((0..taps).map(|i| tap(i, j)).collect())).collect();
         let across = |i: usize| at_points(down.iter().map(|points| points[i].clone()).collect());
         let bias = |pair| if pair == ONES { bias.to_vec() } else { vec![T::ZERO; bias.len()] };
-        let points = (0..POINTS).flat_map(across).enumerate().map(|(pair, g)| Linear::new(g, bias(pair))).collect();
+        let points = (0..POINTS).flat_map(across).enumerate().map(|(pair, g)| Linear::new(&g, bias(pair))).collect();
         Some(Self { tiles, taps, points })
     }
 
     /// Images `[R, S, S, C]`, with [`BEYOND`] numbers behind them, to `[R, S', S', O]`.
-    pub fn forward(&self, x: &[T], y: &mut [T], room: &mut Room<T>) {
+    pub fn forward(&self, x: &[T], y: &mut [T], room: &mut Room<E>) {
         let [inputs, outputs] = self.tiles.sizes();
         let images = self.images();
         for (i, y) in y.chunks_mut(images * outputs).enumerate() {
-            let (inner, d, p) = self.room(y.len() / outputs, room);
+            let [inner, d, p] = self.room(y.len() / outputs, &mut room.numbers);
             for (point, p) in p.chunks_exact_mut(p.len() / POINTS).enumerate() {
                 self.tiles.enter(point, &x[i * images * inputs..], d, inner);
                 for (pair, layer, (d, p)) in self.layers(point, d, p) {
+                    let d = E::along(d, &mut room.factors[0]);
                     if pair == ONES {
                         layer.forward(d, p);
                     } else {
@@ -89,7 +101,7 @@ impl<T: Real> Winograd<T> {
         (x, y_hat): (&[T], &[T]),
         x_hat: Option<&mut [T]>,
         gradient: &mut [LinearGradient<T>],
-        room: &mut Room<T>,
+        room: &mut Room<E>,
     ) {
         let [inputs, outputs] = self.tiles.sizes();
         let images = self.images();
@@ -99,16 +111,20 @@ impl<T: Real> Winograd<T> {
             if let Some(x_hat) = &mut x_hat {
                 x_hat.fill(T::ZERO);
             }
-            let (inner, d, p) = self.room(y_hat.len() / outputs, room);
+            let [inner, d, p] = self.room(y_hat.len() / outputs, &mut room.numbers);
+            let [in_d, in_p] = &mut room.factors;
             let (p, _) = p.split_at_mut(p.len() / POINTS);
             for point in 0..POINTS {
                 self.tiles.enter(point, &x[i * images * inputs..], d, inner);
                 self.tiles.leave_adjoint(point, y_hat, p, inner);
                 for (pair, layer, (d, p)) in self.layers(point, d, p) {
-                    let biased = if pair == ONES { p.len() / layer.outputs } else { 0 };
-                    layer.accumulate(layer.all(), biased, (d, p), &mut gradient[pair]);
+                    let factors = (E::across(d, layer.inputs, in_d), E::across(p, layer.outputs, in_p));
+                    layer.accumulate(layer.all(), factors, &mut gradient[pair]);
+                    if pair == ONES {
+                        gradient[pair].add_bias(layer.all(), p);
+                    }
                     if x_hat.is_some() {
-                        layer.backward(false, layer.all(), p, d);
+                        layer.backward(false, layer.all(), E::along(p, in_p), d);
                     }
                 }
                 if let Some(x_hat) = &mut x_hat {
@@ -142,11 +158,10 @@ impl<T: Real> Winograd<T> {
         AT_ONCE.div_ceil(self.tiles.in_image())
     }
 
-    fn room<'a>(&self, images: usize, room: &'a mut Room<T>) -> (&'a mut [T], &'a mut [T], &'a mut [T]) {
+    fn room<'a>(&self, images: usize, room: &'a mut Numbers<T>) -> [&'a mut [T]; 3] {
         let (tiles, layer) = (images * self.tiles.in_image(), &self.points[0]);
-        let inner = grown(&mut room.tiles, self.tiles.room());
         let d = grown(&mut room.d, POINTS * (tiles * layer.inputs + BEYOND));
-        (inner, d, grown(&mut room.p, PAIRS * tiles * layer.outputs))
+        [grown(&mut room.tiles, self.tiles.room()), d, grown(&mut room.p, PAIRS * tiles * layer.outputs)]
     }
 
     /// The layers, down at one point, with what belongs to them, and which of all pairs they are of.
@@ -155,7 +170,7 @@ impl<T: Real> Winograd<T> {
         point: usize,
         d: &'a mut [T],
         p: &'a mut [T],
-    ) -> impl Iterator<Item = (usize, &'a Linear<T>, (&'a mut [T], &'a mut [T]))> {
+    ) -> impl Iterator<Item = (usize, &'a Layer<E>, (&'a mut [T], &'a mut [T]))> {
         let (size, apart) = (d.len() / POINTS - BEYOND, p.len() / POINTS);
         let d = d.chunks_exact_mut(size + BEYOND).map(move |d| &mut d[..size]);
         let layers = self.points.iter().enumerate().skip(point * POINTS);
