@@ -5,6 +5,7 @@ use super::gate::{mask, rectify};
 use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::norm::Norm;
+use super::readout::{self, Readout};
 use super::real::Real;
 use super::tiles::BEYOND;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
@@ -25,7 +26,7 @@ pub struct Encoder<T: Real> {
     layers: Vec<Layer<T>>,
     /// Of the features, which have their channels first in the checkpoint and last here: the weights are turned rather than they.
     channels: usize,
-    linear: Linear<T>,
+    linear: Readout<T>,
     norm: Option<Norm<T>>,
 }
 
@@ -64,6 +65,7 @@ pub struct Tape<T: Real> {
     x: Vec<T>,
     /// Room for the passes.
     convolution: convolution::Room<T>,
+    linear: readout::Room<T>,
     features_hat: Aligned<T>,
     /// x̂ of a layer, and of the one behind it.
     x_hat: Aligned<T>,
@@ -79,6 +81,7 @@ impl<T: Real> Tape<T> {
             features: zeros(0),
             x: Vec::new(),
             convolution: convolution::Room::new(),
+            linear: readout::Room::new(),
             features_hat: zeros(0),
             x_hat: zeros(0),
             y_hat: zeros(0),
@@ -94,7 +97,8 @@ impl<T: Real> Encoder<T> {
             EncoderConfig::Position(config) => of_positions(config, weights),
         };
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.linear.{part}")));
-        let linear = Linear::new(&turn(&weight, channels, weight.len() / bias.len() / channels), bias);
+        let weight = turn(&weight, channels, weight.len() / bias.len() / channels);
+        let linear = Readout::new(&weight, bias, precision);
         let norm = config.layer_norm().then(|| Norm::named("encoder.norm", weights));
         Self { numbers, layers, channels, linear, norm }
     }
@@ -116,7 +120,7 @@ impl<T: Real> Encoder<T> {
             self.features(inputs, features, (&mut tape.first, &mut tape.groups[i % count]), &mut tape.convolution);
         }
         tape.x.resize(inputs.len() * self.latent(), T::ZERO);
-        self.linear.forward(features, &mut tape.x);
+        self.linear.forward(features, &mut tape.x, &mut tape.linear);
         match &self.norm {
             Some(norm) => norm.forward(&tape.x),
             None => tape.x.clone(),
@@ -138,8 +142,7 @@ impl<T: Real> Encoder<T> {
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
         let features_hat = grown(&mut tape.features_hat, features.len());
-        self.linear.accumulate_all(self.linear.all(), rows, (features, &hat), &mut gradient.linear);
-        self.linear.backward(false, self.linear.all(), &hat, features_hat);
+        self.linear.adjoint((features, &hat), features_hat, &mut gradient.linear, &mut tape.linear);
         let (Some((first, layers)), Some((in_first, in_layers))) =
             (self.layers.split_first(), gradient.layers.split_first_mut())
         else {

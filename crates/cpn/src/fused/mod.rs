@@ -35,6 +35,7 @@ mod outer;
 mod pair;
 mod planner;
 mod product;
+mod readout;
 mod real;
 mod sampling;
 mod tiles;

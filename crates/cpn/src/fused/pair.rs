@@ -100,11 +100,11 @@ fn natively<W: WithSimd>(simd: V4, kernel: W) -> W::Output {
     kernel.with_simd(simd)
 }
 
-/// The nearest bfloat16 in the upper half, and anything in the lower. What an operation leaves as not a number stays so.
+/// The nearest bfloat16 in the upper half, from between two the larger, and anything in the lower. What an operation leaves as not
+/// a number stays so.
 #[inline(always)]
 fn rounded(number: f32) -> u32 {
-    let bits = number.to_bits();
-    bits.wrapping_add(0x7fff + (bits >> 16 & 1))
+    number.to_bits().wrapping_add(0x8000)
 }
 
 struct Along<'a> {
@@ -251,8 +251,8 @@ mod tests {
     fn rounding_is_to_the_nearest_and_keeps_what_is_not_a_number() {
         for (number, expected) in [
             (1.0, 1.0),
-            (1.0 + 1.0 / 256.0, 1.0),
-            (1.0 + 3.0 / 256.0, 1.015_625),
+            (1.0 + 0.99 / 256.0, 1.0),
+            (-1.0 - 1.0 / 256.0, -1.0 - 1.0 / 128.0),
             (-3.01, -3.015_625),
             (f32::INFINITY, f64::INFINITY),
         ] {
