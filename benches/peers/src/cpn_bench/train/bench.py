@@ -18,9 +18,12 @@ from cpn_bench import chart, harness
 from cpn_bench.harness import COMPILED, CURVE, EAGER, JAX, MAIN, OURS, QUICK, Effort, Row, module
 
 COMMAND = "make bench-train"
+BFLOAT16 = "PyTorch eager, bfloat16"
+"""Its encoder by `torch.autocast`, as ours where the processor has instructions for it."""
 METHODS = ("bc", "te-bc", "upn", "cpn")
 PEERS = {
     EAGER: module("train.peer_torch"),
+    BFLOAT16: module("train.peer_torch", "--bfloat16"),
     COMPILED: module("train.peer_torch", "--compile"),
     JAX: module("train.peer_jax"),
 }
@@ -110,7 +113,7 @@ def main(ours: str, out: Path, quick: bool = False) -> str | None:
         harness.write(rows, out / "train.json")
         return stages
 
-    peers, effort = ((EAGER, JAX), QUICK) if quick else ((EAGER, COMPILED, JAX), MAIN)
+    peers, effort = ((EAGER, JAX), QUICK) if quick else ((EAGER, BFLOAT16, COMPILED, JAX), MAIN)
     settings = [Setting(method) for method in METHODS]
     if len(os.sched_getaffinity(0)) > 1:
         settings.append(Setting("cpn", threads=2))

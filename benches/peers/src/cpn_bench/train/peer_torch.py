@@ -26,15 +26,23 @@ from cpn_bench.train.contender import LEARNING_RATE, MAX_GRADIENT_NORM, serve
 class Learner(Agent):
     """A method whose forward pass is the outer loss."""
 
+    in_bfloat16 = False
+    """Whether the encoder computes in it."""
+
     def forward(self, observations: Tensor, goals: Tensor, demonstrated: Tensor, mask: Tensor) -> Tensor:
         """The outer loss of a batch."""
         if self.model.sees_goal:
-            x, goal = self.encoder(torch.cat([observations, goals])).chunk(2)
+            x, goal = self.embed(torch.cat([observations, goals])).chunk(2)
         else:
-            x = goal = self.encoder(observations)
+            x = goal = self.embed(observations)
         planned = self.plan(x, goal) if self.model.plans else self.rollout(x, goal)
         squared = (planned - demonstrated).square() * mask.unsqueeze(-1)
         return squared.sum() / (mask.sum() * demonstrated.shape[-1])
+
+    def embed(self, images: Tensor) -> Tensor:
+        """`[B, 84, 84, 3]` bytes to `[B, Z]`."""
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.in_bfloat16):
+            return self.encoder(images).to(self.step_size.dtype)
 
     def plan(self, x: Tensor, goal: Tensor) -> Tensor:
         """The policy's rollout, improved by gradient descent on the predicted distance to the goal."""
@@ -53,16 +61,19 @@ class Learner(Agent):
 class Trainer:
     """An agent with its optimiser and its batches."""
 
-    def __init__(self, batches: Batches, compiled: bool = False) -> None:
+    def __init__(self, batches: Batches, compiled: bool = False, bfloat16: bool = False) -> None:
         self.data = tensors(batches.arrays)
         self.count = len(batches)
         self.agent = Learner(batches.model, tensors(batches.weights))
+        self.bfloat16 = bfloat16
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=LEARNING_RATE, fused=True)
         self.outer_loss = torch.compile(self.agent, fullgraph=True) if compiled else self.agent
 
     def step(self, number: int) -> Callable[[], float]:
         """Takes a training step."""
         self.optimizer.zero_grad()
+        # The first loss is compared with others', in float32.
+        self.agent.in_bfloat16 = self.bfloat16 and number > 0
         loss = self.outer_loss(*self.batch(number))
         loss.backward()
         nn.utils.clip_grad_norm_(self.agent.parameters(), MAX_GRADIENT_NORM)
@@ -77,10 +88,10 @@ class Trainer:
         return observations, goals, data["actions"][row], data["mask"][row]
 
 
-def main(batches: Path, method: str, threads: int, compile: bool = False) -> None:  # noqa: A002 - the option's name
+def main(batches: Path, method: str, threads: int, compile: bool = False, bfloat16: bool = False) -> None:  # noqa: A002 - the option's name
     """Trains as asked on stdin."""
     torch.set_num_threads(threads)
-    serve(Trainer(Batches.read(batches, method), compiled=compile))
+    serve(Trainer(Batches.read(batches, method), compiled=compile, bfloat16=bfloat16))
 
 
 if __name__ == "__main__":
