@@ -50,7 +50,7 @@ pub struct OuterLoss {
 }
 
 impl OuterLoss {
-    /// For agents like this one, with convolutions of this precision, on some threads.
+    /// For agents like this one, with images embedded in this precision, on some threads.
     pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
         Self {
             embedder: Embedder::new(agent.config().encoder.clone(), precision, threads),

@@ -32,7 +32,7 @@ pub struct Config {
     pub batch_delay_ms: u16,
     /// Threads that plans which are made together are spread over.
     pub threads: NonZeroU16,
-    /// What the convolutions over images multiply: bfloat16, where the processor has instructions for it (AVX512-BF16), is faster,
+    /// What images are embedded in: bfloat16, where the processor has instructions for it (AVX512-BF16), is faster,
     /// and close.
     pub precision: Precision,
     /// Where Prometheus finds metrics; none are served if it is not given.
@@ -115,7 +115,7 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<NonZeroU16>,
-    /// What convolutions multiply, float32 or, where the processor has instructions for it (AVX512-BF16), bfloat16 [default: float32].
+    /// What images are embedded in, float32 or, where the processor has instructions for it (AVX512-BF16), bfloat16 [default: float32].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub precision: Option<String>,

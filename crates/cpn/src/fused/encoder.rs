@@ -90,11 +90,12 @@ impl<T: Real> Tape<T> {
 }
 
 impl<T: Real> Encoder<T> {
-    /// Reads the weights of a valid configuration, whose convolutions multiply with this precision.
+    /// Reads the weights of a valid configuration. Images are multiplied in this precision, positions as they are: there is little
+    /// to multiply, and a place needs more than 8 bits.
     pub fn new(config: &EncoderConfig, precision: Precision, weights: &impl Weights<T>) -> Self {
-        let (numbers, layers, channels) = match config {
-            EncoderConfig::Image(config) => of_images(config, precision, weights),
-            EncoderConfig::Position(config) => of_positions(config, weights),
+        let ((numbers, layers, channels), precision) = match config {
+            EncoderConfig::Image(config) => (of_images(config, precision, weights), precision),
+            EncoderConfig::Position(config) => (of_positions(config, weights), Precision::Float32),
         };
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.linear.{part}")));
         let weight = turn(&weight, channels, weight.len() / bias.len() / channels);

@@ -53,7 +53,7 @@ pub(super) struct Worker<T: Real> {
 }
 
 impl Planner {
-    /// Lays out an agent's weights for plans on `threads` threads, at least one, with convolutions of this precision.
+    /// Lays out an agent's weights for plans on `threads` threads, at least one, with images embedded in this precision.
     pub fn new(agent: Agent, precision: Precision, threads: usize) -> Self {
         let (config, variables) = (agent.config().clone(), agent.variables().variables());
         let weights = &Variables(&variables);
