@@ -130,8 +130,7 @@ impl<T: Real> Attenuated<T> {
         second: Option<(&[T], &[T])>,
         tape: &mut AttenuatedTape<T>,
         scratch: &mut Aligned<T>,
-        x_hat: &mut [T],
-        gradient: &mut AttenuatedGradient<T>,
+        (x_hat, gradient): (&mut [T], &mut AttenuatedGradient<T>),
     ) {
         let AttenuatedTape { open, gate } = tape;
         for part in self.parts(rows, open) {

@@ -126,10 +126,10 @@ impl<T: Real> Gated<T> {
         let ((x_now, x_dot), (y_hat, y_bar)) = (x.split_at(rows * self.inputs()), y.split_at(rows * self.outputs()));
         let is_second = !y_bar.is_empty();
         let second = is_second.then_some((x_dot, y_bar));
-        self.a.adjoint(rows, (x_now, y_hat), second, &mut tape.a, scratch, x_hat, &mut gradient.a);
+        self.a.adjoint(rows, (x_now, y_hat), second, &mut tape.a, scratch, (x_hat, &mut gradient.a));
         let second = is_second.then_some((&*tape.zeros, y_bar));
         let (ones, nothing) = (&tape.ones, &mut tape.nothing);
-        self.b.adjoint(rows, (ones, y_hat), second, &mut tape.b, scratch, nothing, &mut gradient.b);
+        self.b.adjoint(rows, (ones, y_hat), second, &mut tape.b, scratch, (nothing, &mut gradient.b));
         self.a.gate.leave_adjoint(rows, x, &tape.a.gate, x_hat, &mut gradient.a.gate);
         self.b.gate.leave_adjoint(rows, x, &tape.b.gate, x_hat, &mut gradient.b.gate);
     }
