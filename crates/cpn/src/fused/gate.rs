@@ -8,8 +8,8 @@ use super::rectified::{Open, rectify};
 use super::sparse::{Part, Sparse, SparseGradient};
 use std::ops::Range;
 
-/// Weights of a part: 32 KB in float32.
-const PART: usize = 1 << 13;
+/// Weights of a part: 16 KB in float32.
+const PART: usize = 1 << 12;
 
 /// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁), in a block of outputs for each number that is
 /// attenuated for all of them.
