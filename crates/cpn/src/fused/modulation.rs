@@ -1,23 +1,44 @@
-//! What the passes over attenuated weights do for each of them. The formulas stand in [`gated`](super::gated).
+//! What the passes over a neuromodulated layer do for each weight. The formulas stand in [`gated`](super::gated).
 //!
-//! Each kernel runs over R samples and a part of the inputs; `a` is `[inputs, O']`, what belongs to u is `[R, some inputs, O']`,
-//! the rest `[R, inputs]` or `[R, O]`.
+//! Each kernel runs over R samples and some of the outputs; `a` is `[outputs, inputs]`, what belongs to u is `[R, some outputs,
+//! inputs]`, the rest `[R, inputs]` or `[R, outputs]`.
 
-use super::attenuated::Attenuated;
 use super::lanes::{Lanes, registers, registers_mut};
+use super::linear::{Linear, LinearGradient};
 use super::real::Real;
-use super::sparse::Part;
 use pulp::{Simd, WithSimd};
+use std::ops::Range;
 
-/// Adds to y; turns s - b₂ into u on the way.
+/// σ(s) of s - b₂, row by row.
+#[derive(Debug)]
+pub struct Sigmoid<'a, T> {
+    pub s: &'a mut [T],
+    pub bias: &'a [T],
+}
+
+impl<T: Real> WithSimd for Sigmoid<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let count = Lanes::<S, T>::COUNT;
+        for row in self.s.chunks_exact_mut(self.bias.len()) {
+            for (s, bias) in row.chunks_mut(count).zip(self.bias.chunks(count)) {
+                (Lanes::load(simd, s) + Lanes::load(simd, bias)).sigmoid().store(s);
+            }
+        }
+    }
+}
+
+/// Some of y; turns s - b₂ into u on the way.
 #[derive(Debug)]
 pub struct Forward<'a, T> {
-    pub layer: &'a Attenuated<T>,
-    pub part: &'a Part<'a>,
-    /// b₂, `[some inputs, O']`.
-    pub bias: &'a [T],
+    pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
+    pub u_bias: &'a [T],
     pub x: &'a [T],
     pub u: &'a mut [T],
+    pub v: &'a [T],
     pub y: &'a mut [T],
 }
 
@@ -26,39 +47,62 @@ impl<T: Real> WithSimd for Forward<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { layer, part, bias, x, u, y } = self;
-        let Attenuated { inputs, outputs, ref a, .. } = *layer;
-        let (width, count) = (layer.width(), Lanes::<S, T>::COUNT);
-        for r in 0..part.rows {
-            let (x, y) = (&x[r * inputs..][..inputs], &mut y[r * outputs..][..outputs]);
-            for (w, y) in y.chunks_mut(count).enumerate() {
-                let mut sum = Lanes::load(simd, y);
-                for i in part.wanted(r) {
-                    let at = part.at(0, i, width) + w * count;
-                    let ([bias, a], u) = (
-                        Lanes::load_each(simd, [&bias[at..], &a[i * width + w * count..]]),
-                        &mut u[part.at(r, i, width) + w * count..],
-                    );
-                    let open = (Lanes::load(simd, u) + bias).sigmoid();
-                    open.store(u);
-                    sum = (open * a).mul_add(Lanes::splat(simd, x[i]), sum);
-                }
-                sum.store(y);
+        let Self { linear, outputs: part, u_bias, x, u, v, y } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let weight = &linear.weight()[part.start * inputs..];
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            for (j, o) in part.clone().enumerate() {
+                let at = r * outputs + o;
+                let u = &mut u[(r * part.len() + j) * inputs..][..inputs];
+                let row = j * inputs..(j + 1) * inputs;
+                let (u_bias, a) = (&u_bias[row.clone()], &weight[row]);
+                let sum = open(simd, u, [u_bias, a, x]);
+                y[at] = sum.sum() + v[at] * linear.bias()[o];
             }
         }
     }
 }
 
-/// Adds to x̄; s̄.
+/// Turns a row of s - b₂ into u, and answers Σ u a x, yet to be summed over the lanes.
+#[inline(always)]
+fn open<S: Simd, T: Real>(simd: S, u: &mut [T], [bias, a, x]: [&[T]; 3]) -> Lanes<S, T> {
+    let mut sum = Lanes::splat(simd, T::ZERO);
+    let count = u.len() / Lanes::<S, T>::COUNT;
+    {
+        // Slices of registers, all as long, are read without looking for their ends each time.
+        let [u] = registers_mut(simd, [&mut *u], count);
+        let [bias, a, x] = registers(simd, [bias, a, x], count);
+        for i in 0..count {
+            u[i] = open_lanes(Lanes::each(simd, [u[i], bias[i], a[i], x[i]]), &mut sum).values();
+        }
+    }
+    let rest = count * Lanes::<S, T>::COUNT..u.len();
+    if !rest.is_empty() {
+        let rows = [&u[rest.clone()], &bias[rest.clone()], &a[rest.clone()], &x[rest.clone()]];
+        open_lanes(Lanes::load_each(simd, rows), &mut sum).store(&mut u[rest]);
+    }
+    sum
+}
+
+#[inline(always)]
+fn open_lanes<S: Simd, T: Real>([s, bias, a, x]: [Lanes<S, T>; 4], sum: &mut Lanes<S, T>) -> Lanes<S, T> {
+    let open = (s + bias).sigmoid();
+    *sum = (open * a).mul_add(x, *sum);
+    open
+}
+
+/// Adds to x̄; s̄ of both gates.
 #[derive(Debug)]
 pub struct Backward<'a, T> {
-    pub layer: &'a Attenuated<T>,
-    pub part: &'a Part<'a>,
+    pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub u: &'a [T],
+    pub v: &'a [T],
     pub y_bar: &'a [T],
     pub x_bar: &'a mut [T],
-    pub s_bar: &'a mut [T],
+    pub s_u: &'a mut [T],
+    pub s_v: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for Backward<'_, T> {
@@ -66,37 +110,44 @@ impl<T: Real> WithSimd for Backward<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { layer, part, x, u, y_bar, x_bar, s_bar } = self;
-        let Attenuated { inputs, outputs, ref a, .. } = *layer;
-        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
-        for r in 0..part.rows {
-            let y_bar = &y_bar[r * outputs..][..outputs];
-            for i in part.wanted(r) {
-                let (at, x) = (part.at(r, i, width), Lanes::splat(simd, x[r * inputs + i]));
-                let [u, a] = line(simd, [&u[at..], &a[i * width..]], width);
-                let [s_bar] = line_mut(simd, [&mut s_bar[at..]], width);
-                let mut sum = Lanes::splat(simd, T::ZERO);
-                for (w, s_bar) in s_bar.iter_mut().enumerate() {
-                    let [u, a] = Lanes::each(simd, [u[w], a[w]]);
-                    let open = of(simd, y_bar, w) * u * a;
+        let Self { linear, outputs: part, x, u, v, y_bar, x_bar, s_u, s_v } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let one = Lanes::splat(simd, T::ONE);
+        let weight = &linear.weight()[part.start * inputs..];
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            let block = r * part.len() * inputs;
+            let y_bar = &y_bar[r * outputs..][part.clone()];
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let x_bar = &mut x_bar[r * inputs..][i..inputs];
+                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_bar));
+                for (j, y) in y_bar.iter().enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
+                    let open = Lanes::splat(simd, *y) * u * a;
                     sum = sum + open;
-                    *s_bar = (open * (one - u) * x).values();
+                    (open * (one - u) * x).store(&mut s_u[block..][from..to]);
                 }
-                x_bar[r * inputs + i] += sum.sum();
+                sum.store(x_bar);
+            }
+            for (o, y_bar) in part.clone().zip(y_bar) {
+                let at = r * outputs + o;
+                s_v[at] = *y_bar * linear.bias()[o] * v[at] * (T::ONE - v[at]);
             }
         }
     }
 }
 
-/// Adds to ẏ.
+/// ẏ.
 #[derive(Debug)]
 pub struct Tangent<'a, T> {
-    pub layer: &'a Attenuated<T>,
-    pub part: &'a Part<'a>,
+    pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub x_dot: &'a [T],
     pub u: &'a [T],
-    pub s_dot: &'a [T],
+    pub v: &'a [T],
+    pub s_dot_u: &'a [T],
+    pub s_dot_v: &'a [T],
     pub y_dot: &'a mut [T],
 }
 
@@ -105,36 +156,41 @@ impl<T: Real> WithSimd for Tangent<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { layer, part, x, x_dot, u, s_dot, y_dot } = self;
-        let Attenuated { inputs, outputs, ref a, .. } = *layer;
-        let (width, count, one) = (layer.width(), Lanes::<S, T>::COUNT, Lanes::splat(simd, T::ONE));
-        for r in 0..part.rows {
-            let [x, x_dot] = [x, x_dot].map(|x| &x[r * inputs..][..inputs]);
-            for (w, y_dot) in y_dot[r * outputs..][..outputs].chunks_mut(count).enumerate() {
-                let mut sum = Lanes::load(simd, y_dot);
-                for i in part.wanted(r) {
-                    let at = part.at(r, i, width) + w * count;
-                    let [u, s_dot, a] = Lanes::load_each(simd, [&u[at..], &s_dot[at..], &a[i * width + w * count..]]);
-                    let (x, x_dot) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, x_dot[i]));
+        let Self { linear, outputs: part, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let one = Lanes::splat(simd, T::ONE);
+        for r in 0..x.len() / inputs {
+            let row = r * inputs..(r + 1) * inputs;
+            let (x, x_dot) = (&x[row.clone()], &x_dot[row]);
+            for (j, o) in part.clone().enumerate() {
+                let (at, place) = (r * outputs + o, (r * part.len() + j) * inputs);
+                let a = &linear.weight()[o * inputs..][..inputs];
+                let (u, s_dot) = (&u[place..][..inputs], &s_dot_u[place..][..inputs]);
+                let mut sum = Lanes::splat(simd, T::ZERO);
+                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                    let [u, s_dot, a] = Lanes::load_each(simd, [&u[i..], &s_dot[i..], &a[i..]]);
+                    let [x, x_dot] = Lanes::load_each(simd, [&x[i..], &x_dot[i..]]);
                     sum = (a * u).mul_add(((one - u) * s_dot).mul_add(x, x_dot), sum);
                 }
-                sum.store(y_dot);
+                y_dot[at] = sum.sum() + v[at] * (T::ONE - v[at]) * s_dot_v[at] * linear.bias()[o];
             }
         }
     }
 }
 
-/// Adds to x̂ and to the gradient; ŝ: the terms of ŷ.
+/// Adds to x̂ and to the gradient; ŝ of both gates: the terms of ŷ.
 #[derive(Debug)]
 pub struct FirstAdjoint<'a, T> {
-    pub layer: &'a Attenuated<T>,
-    pub part: &'a Part<'a>,
+    pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     pub x: &'a [T],
     pub u: &'a [T],
+    pub v: &'a [T],
     pub y_hat: &'a [T],
     pub x_hat: &'a mut [T],
-    pub s_hat: &'a mut [T],
-    pub in_a: &'a mut [T],
+    pub s_u: &'a mut [T],
+    pub s_v: &'a mut [T],
+    pub gradient: &'a mut LinearGradient<T>,
 }
 
 impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
@@ -142,45 +198,55 @@ impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { layer, part, x, u, y_hat, x_hat, s_hat, in_a } = self;
-        let Attenuated { inputs, outputs, ref a, .. } = *layer;
-        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
-        for r in 0..part.rows {
-            let y_hat = &y_hat[r * outputs..][..outputs];
-            for i in part.wanted(r) {
-                let (at, x) = (part.at(r, i, width), Lanes::splat(simd, x[r * inputs + i]));
-                let [u, a] = line(simd, [&u[at..], &a[i * width..]], width);
-                let [s_hat, in_a] = line_mut(simd, [&mut s_hat[at..], &mut in_a[i * width..]], width);
-                let mut sum = Lanes::splat(simd, T::ZERO);
-                for w in 0..u.len() {
-                    let [u, a, in_weight] = Lanes::each(simd, [u[w], a[w], in_a[w]]);
-                    let open = of(simd, y_hat, w) * u;
+        let Self { linear, outputs: part, x, u, v, y_hat, x_hat, s_u, s_v, gradient } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let one = Lanes::splat(simd, T::ONE);
+        let weights = part.start * inputs..part.end * inputs;
+        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
+        for (r, x) in x.chunks_exact(inputs).enumerate() {
+            let block = r * weights.len();
+            let y_hat = &y_hat[r * outputs..][part.clone()];
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let x_hat = &mut x_hat[r * inputs..][i..inputs];
+                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_hat));
+                for (j, y) in y_hat.iter().enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
+                    let open = Lanes::splat(simd, *y) * u;
                     sum = open.mul_add(a, sum);
-                    let open = open * x;
-                    in_a[w] = (in_weight + open).values();
-                    s_hat[w] = (open * (one - u) * a).values();
+                    (open * x).add_to(&mut in_weight[from..to]);
+                    (open * (one - u) * a * x).store(&mut s_u[block..][from..to]);
                 }
-                x_hat[r * inputs + i] += sum.sum();
+                sum.store(x_hat);
+            }
+            for (o, y_hat) in part.clone().zip(y_hat) {
+                let at = r * outputs + o;
+                let open = *y_hat * v[at];
+                gradient.bias[o] += open;
+                s_v[at] = open * (T::ONE - v[at]) * linear.bias()[o];
             }
         }
     }
 }
 
-/// Adds to x̂ and to the gradient; ŝ and s̄: the terms of ŷ and of ȳ.
+/// Adds to x̂ and to the gradient; ŝ and s̄ of both gates: the terms of ŷ and of ȳ.
 #[derive(Debug)]
 pub struct SecondAdjoint<'a, T> {
-    pub layer: &'a Attenuated<T>,
-    pub part: &'a Part<'a>,
+    pub linear: &'a Linear<T>,
+    pub outputs: Range<usize>,
     /// x and ẋ.
-    pub xs: (&'a [T], &'a [T]),
+    pub x: (&'a [T], &'a [T]),
     pub u: &'a [T],
-    pub s_dot: &'a [T],
+    pub v: &'a [T],
+    pub s_dot_u: &'a [T],
+    pub s_dot_v: &'a [T],
     /// ŷ and ȳ.
-    pub ys: (&'a [T], &'a [T]),
+    pub y: (&'a [T], &'a [T]),
     pub x_hat: &'a mut [T],
     /// ŝ and s̄.
-    pub ss: (&'a mut [T], &'a mut [T]),
-    pub in_a: &'a mut [T],
+    pub s_u: (&'a mut [T], &'a mut [T]),
+    pub s_v: (&'a mut [T], &'a mut [T]),
+    pub gradient: &'a mut LinearGradient<T>,
 }
 
 impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
@@ -188,52 +254,43 @@ impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { layer, part, xs, u, s_dot, ys, x_hat, ss, in_a } = self;
-        let Attenuated { inputs, outputs, ref a, .. } = *layer;
-        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
-        for r in 0..part.rows {
-            let [y_hat, y_bar] = [ys.0, ys.1].map(|y| &y[r * outputs..][..outputs]);
-            for i in part.wanted(r) {
-                let at = part.at(r, i, width);
-                let of_row = r * inputs + i;
-                let (x, x_dot) = (Lanes::splat(simd, xs.0[of_row]), Lanes::splat(simd, xs.1[of_row]));
-                let [u, s_dot, a] = line(simd, [&u[at..], &s_dot[at..], &a[i * width..]], width);
-                let [s_hat, s_bar, in_a] =
-                    line_mut(simd, [&mut ss.0[at..], &mut ss.1[at..], &mut in_a[i * width..]], width);
-                let mut sum = Lanes::splat(simd, T::ZERO);
-                for w in 0..u.len() {
-                    let [u, s_dot, a, in_weight] = Lanes::each(simd, [u[w], s_dot[w], a[w], in_a[w]]);
-                    let (y_hat, y_bar) = (of(simd, y_hat, w), of(simd, y_bar, w));
+        let Self { linear, outputs: part, x: xs, u, v, s_dot_u, s_dot_v, y: ys, x_hat, s_u, s_v, gradient } = self;
+        let Linear { inputs, outputs, .. } = *linear;
+        let one = Lanes::splat(simd, T::ONE);
+        let weights = part.start * inputs..part.end * inputs;
+        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
+        for r in 0..xs.0.len() / inputs {
+            let row = r * inputs..(r + 1) * inputs;
+            let (xs, x_hat) = ((&xs.0[row.clone()], &xs.1[row.clone()]), &mut x_hat[row]);
+            let block = r * weights.len();
+            let (y_hat, y_bar) = (&ys.0[r * outputs..][part.clone()], &ys.1[r * outputs..][part.clone()]);
+            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
+                let [x, x_dot, mut sum] = Lanes::load_each(simd, [&xs.0[i..], &xs.1[i..], &x_hat[i..]]);
+                for (j, (y_hat, y_bar)) in y_hat.iter().zip(y_bar).enumerate() {
+                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
+                    let [u, s_dot] = Lanes::load_each(simd, [&u[block..][from..to], &s_dot_u[block..][from..to]]);
+                    let (a, in_a) = (Lanes::load(simd, &weight[from..to]), &mut in_weight[from..to]);
+                    let (y_hat, y_bar) = (Lanes::splat(simd, *y_hat), Lanes::splat(simd, *y_bar));
                     let shut = one - u;
                     let slope = u * shut;
                     let moved = y_bar * s_dot;
                     let (p, q) = (y_hat.mul_add(x, y_bar * x_dot), moved * x);
                     sum = a.mul_add(y_hat.mul_add(u, moved * slope), sum);
-                    in_a[w] = (u.mul_add(p, slope.mul_add(q, in_weight))).values();
+                    u.mul_add(p, slope * q).add_to(in_a);
                     let slope = a * slope;
-                    s_hat[w] = (slope * (shut - u).mul_add(q, p)).values();
-                    s_bar[w] = (slope * y_bar * x).values();
+                    (slope * (shut - u).mul_add(q, p)).store(&mut s_u.0[block..][from..to]);
+                    (slope * y_bar * x).store(&mut s_u.1[block..][from..to]);
                 }
-                x_hat[r * inputs + i] += sum.sum();
+                sum.store(&mut x_hat[i..]);
+            }
+            for (o, (y_hat, y_bar)) in part.clone().zip(y_hat.iter().zip(y_bar)) {
+                let at = r * outputs + o;
+                let (v, b) = (v[at], linear.bias()[o]);
+                let (slope, moved) = (v * (T::ONE - v), *y_bar * s_dot_v[at]);
+                gradient.bias[o] += v * *y_hat + slope * moved;
+                s_v.0[at] = b * slope * (*y_hat + (T::ONE - v - v) * moved);
+                s_v.1[at] = b * slope * *y_bar;
             }
         }
     }
-}
-
-/// The registers of one input.
-#[inline(always)]
-fn line<S: Simd, T: Real, const N: usize>(simd: S, slices: [&[T]; N], width: usize) -> [&[T::Lanes<S>]; N] {
-    registers(simd, slices, width / Lanes::<S, T>::COUNT)
-}
-
-/// The same, to be written.
-#[inline(always)]
-fn line_mut<S: Simd, T: Real, const N: usize>(simd: S, slices: [&mut [T]; N], width: usize) -> [&mut [T::Lanes<S>]; N] {
-    registers_mut(simd, slices, width / Lanes::<S, T>::COUNT)
-}
-
-/// Register w of a row of O numbers, with zeros behind its end.
-#[inline(always)]
-fn of<S: Simd, T: Real>(simd: S, row: &[T], w: usize) -> Lanes<S, T> {
-    Lanes::load(simd, &row[w * Lanes::<S, T>::COUNT..])
 }
