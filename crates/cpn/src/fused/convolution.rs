@@ -1,9 +1,9 @@
 //! A convolution of the encoder, with the rectified linear unit behind it.
 
-use super::gate::rectify;
 use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient};
 use super::real::Real;
+use super::rectified::rectify;
 use super::winograd::{self, Winograd};
 use crate::encoder::Precision;
 
@@ -159,9 +159,9 @@ impl<T: Real> Patches<T> {
     ) {
         let Self { starts, places, linear, .. } = self;
         let patches = self.copied(x, patches);
-        linear.accumulate_all(linear.all(), starts.len(), (patches, y_hat), gradient);
+        linear.accumulate_all(starts.len(), (patches, y_hat), gradient);
         let Some(x_hat) = x_hat else { return };
-        linear.backward(false, linear.all(), y_hat, patches);
+        linear.backward(y_hat, patches);
         x_hat.fill(T::ZERO);
         for (patch, start) in patches.chunks_exact(places.len()).zip(starts) {
             patch.iter().zip(places).for_each(|(number, place)| x_hat[start + place] += *number);

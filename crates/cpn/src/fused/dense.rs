@@ -1,10 +1,13 @@
 //! A layer of g_θ, plain or neuromodulated, and its four passes over a block of R samples.
 
-use super::gate::GateGradient;
-use super::gated::{Gated, GatesGradient, GatesTape, Scratch};
+use super::attenuated::Scratch;
+use super::gated::{Gated, GatedGradient, GatedTape};
 use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
+
+/// Tapes and gradients are made by the layer that they are used with.
+const MISMATCH: &str = "a layer is plain or gated, and so are its tape and its gradient";
 
 /// y = a x + b, or y = (u(x) ⊙ a) x + v(x) ⊙ b.
 #[derive(Debug)]
@@ -15,9 +18,9 @@ pub enum Dense<T> {
 
 /// What a loss changes by when a layer's weights do.
 #[derive(Debug)]
-pub struct DenseGradient<T> {
-    pub linear: LinearGradient<T>,
-    pub gates: Option<Box<GatesGradient<T>>>,
+pub enum DenseGradient<T> {
+    Plain(LinearGradient<T>),
+    Gated(Box<GatedGradient<T>>),
 }
 
 /// What the passes over a layer leave for each other.
@@ -29,7 +32,7 @@ pub struct Tape<T> {
     x: Aligned<T>,
     /// ŷ and ȳ, `[2 R, outputs]`.
     y: Aligned<T>,
-    gates: Option<GatesTape<T>>,
+    gates: Option<GatedTape<T>>,
 }
 
 impl<T: Real> Tape<T> {
@@ -55,16 +58,13 @@ impl<T: Real> Tape<T> {
 }
 
 impl<T: Real> DenseGradient<T> {
-    /// Every tensor, by its name in a checkpoint.
-    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
-        let mut tensors = self.linear.tensors(name);
-        if let Some(gates) = &mut self.gates {
-            for (gate, GateGradient { hidden, output }) in [("u", &mut gates.u), ("v", &mut gates.v)] {
-                tensors.extend(hidden.tensors(&format!("{name}.{gate}.hidden")));
-                tensors.extend(output.tensors(&format!("{name}.{gate}.output")));
-            }
+    /// Adds another of the same layer.
+    pub fn add(&mut self, other: &Self) {
+        match (self, other) {
+            (Self::Plain(ours), Self::Plain(other)) => ours.add(other),
+            (Self::Gated(ours), Self::Gated(other)) => ours.add(other),
+            _ => unreachable!("{MISMATCH}"),
         }
-        tensors
     }
 }
 
@@ -76,38 +76,39 @@ pub enum Order {
 }
 
 impl<T: Real> Dense<T> {
-    /// The layer of this name in a checkpoint.
-    pub fn named(name: &str, weights: &impl Weights<T>, gated: bool) -> Self {
+    /// The layer of this name in a checkpoint. Of its inputs the first are what a rectified linear unit `rectified`, none if that
+    /// is 0.
+    pub fn named(name: &str, rectified: usize, weights: &impl Weights<T>, gated: bool) -> Self {
         if gated {
-            Self::Gated(Box::new(Gated::named(name, weights)))
+            Self::Gated(Box::new(Gated::named(name, rectified, weights)))
         } else {
             Self::Plain(Linear::named(name, weights))
         }
     }
 
-    fn linear(&self) -> &Linear<T> {
-        match self {
-            Self::Plain(linear) => linear,
-            Self::Gated(gated) => &gated.linear,
-        }
-    }
-
-    fn gated(&self) -> Option<&Gated<T>> {
-        match self {
-            Self::Plain(_) => None,
-            Self::Gated(gated) => Some(gated),
-        }
-    }
-
     /// A gradient of zeros.
     pub fn gradient(&self) -> DenseGradient<T> {
-        DenseGradient { linear: self.linear().gradient(), gates: self.gated().map(|gated| Box::new(gated.gradient())) }
+        match self {
+            Self::Plain(linear) => DenseGradient::Plain(linear.gradient()),
+            Self::Gated(gated) => DenseGradient::Gated(Box::new(gated.gradient())),
+        }
+    }
+
+    /// A gradient by the names of the weights.
+    pub fn in_weights(&self, name: &str, gradient: &DenseGradient<T>) -> Vec<(String, Vec<T>)> {
+        match (self, gradient) {
+            (Self::Plain(_), DenseGradient::Plain(gradient)) => gradient.in_weights(name),
+            (Self::Gated(gated), DenseGradient::Gated(gradient)) => gated.in_weights(name, gradient),
+            _ => unreachable!("{MISMATCH}"),
+        }
     }
 
     /// A tape for blocks of up to R = `rows` samples.
     pub fn tape(&self, rows: usize) -> Tape<T> {
-        let Linear { inputs, outputs, .. } = *self.linear();
-        let gates = self.gated().map(|gated| gated.tape(rows));
+        let (inputs, outputs, gates) = match self {
+            Self::Plain(linear) => (linear.inputs, linear.outputs, None),
+            Self::Gated(gated) => (gated.inputs(), gated.outputs(), Some(gated.tape(rows))),
+        };
         Tape { inputs, outputs, x: zeros(2 * rows * inputs), y: zeros(2 * rows * outputs), gates }
     }
 
@@ -115,8 +116,9 @@ impl<T: Real> Dense<T> {
     pub fn forward(&self, rows: usize, tape: &mut Tape<T>, y: &mut [T]) {
         let x = &tape.x[..rows * tape.inputs];
         match (self, &mut tape.gates) {
+            (Self::Plain(linear), _) => linear.forward(x, y),
             (Self::Gated(gated), Some(gates)) => gated.forward(rows, x, gates, y),
-            _ => self.linear().forward(x, y),
+            _ => unreachable!("{MISMATCH}"),
         }
     }
 
@@ -124,8 +126,9 @@ impl<T: Real> Dense<T> {
     pub fn backward(&self, rows: usize, tape: &mut Tape<T>, scratch: &mut Scratch<T>, x_bar: &mut [T]) {
         let (x, y_bar) = (&tape.x[..rows * tape.inputs], &tape.y[rows * tape.outputs..2 * rows * tape.outputs]);
         match (self, &mut tape.gates) {
+            (Self::Plain(linear), _) => linear.add_backward(y_bar, x_bar),
             (Self::Gated(gated), Some(gates)) => gated.backward(rows, (x, y_bar), gates, scratch, x_bar),
-            _ => self.linear().backward(true, self.linear().all(), y_bar, x_bar),
+            _ => unreachable!("{MISMATCH}"),
         }
     }
 
@@ -133,8 +136,9 @@ impl<T: Real> Dense<T> {
     pub fn tangent(&self, rows: usize, tape: &mut Tape<T>, y_dot: &mut [T]) {
         let x = &tape.x[..2 * rows * tape.inputs];
         match (self, &mut tape.gates) {
+            (Self::Plain(linear), _) => linear.tangent(&x[rows * tape.inputs..], y_dot),
             (Self::Gated(gated), Some(gates)) => gated.tangent(rows, x, gates, y_dot),
-            _ => self.linear().tangent(self.linear().all(), &x[rows * tape.inputs..], y_dot),
+            _ => unreachable!("{MISMATCH}"),
         }
     }
 
@@ -150,14 +154,15 @@ impl<T: Real> Dense<T> {
     ) {
         let stacked = if order == Order::First { rows } else { 2 * rows };
         let (x, y) = (&tape.x[..stacked * tape.inputs], &tape.y[..stacked * tape.outputs]);
-        match (self, &mut tape.gates, &mut gradient.gates) {
-            (Self::Gated(gated), Some(gates), Some(in_gates)) => {
-                gated.adjoint(rows, (x, y), gates, scratch, x_hat, (&mut gradient.linear, in_gates));
+        match (self, &mut tape.gates, gradient) {
+            (Self::Plain(linear), _, DenseGradient::Plain(gradient)) => {
+                linear.accumulate_all(rows, (x, y), gradient);
+                linear.add_backward(&y[..rows * tape.outputs], x_hat);
             }
-            _ => {
-                self.linear().accumulate_all(self.linear().all(), rows, (x, y), &mut gradient.linear);
-                self.linear().backward(true, self.linear().all(), &y[..rows * tape.outputs], x_hat);
+            (Self::Gated(gated), Some(gates), DenseGradient::Gated(gradient)) => {
+                gated.adjoint(rows, (x, y), gates, scratch, x_hat, gradient);
             }
+            _ => unreachable!("{MISMATCH}"),
         }
     }
 }

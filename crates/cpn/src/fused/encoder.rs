@@ -1,12 +1,12 @@
 //! The encoder f_φ.
 
 use super::convolution::{self, Convolution, turn};
-use super::gate::{mask, rectify};
 use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::norm::Norm;
 use super::readout::{self, Readout};
 use super::real::Real;
+use super::rectified::{mask, rectify};
 use super::tiles::BEYOND;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::encoder::Precision;
@@ -313,9 +313,9 @@ impl<T: Real> Layer<T> {
         match self {
             Self::Convolution(convolution) => convolution.adjoint((x, y_hat), x_hat, gradient, room),
             Self::Linear(linear) => {
-                linear.accumulate_all(linear.all(), rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
+                linear.accumulate_all(rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
                 if let Some(x_hat) = x_hat {
-                    linear.backward(false, linear.all(), y_hat, x_hat);
+                    linear.backward(y_hat, x_hat);
                 }
             }
         }

@@ -1,139 +1,162 @@
-//! u_β or v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to the [layer that is
-//! attenuated](super::gated), which runs over the same numbers anyway, and asks for them part by part.
+//! u_β or v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to [what is
+//! attenuated](super::attenuated), which runs over the same numbers anyway, and asks for them part by part.
 
 use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
-use pulp::{Arch, Simd, WithSimd};
+use super::rectified::{Open, rectify};
+use super::sparse::{Part, Sparse, SparseGradient};
 use std::ops::Range;
 
-/// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁).
+/// Weights of a part: 32 KB in float32.
+const PART: usize = 1 << 13;
+
+/// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁), in a block of outputs for each number that is
+/// attenuated for all of them.
 #[derive(Debug)]
 pub struct Gate<T> {
     hidden: Linear<T>,
-    output: Linear<T>,
+    output: Sparse<T>,
 }
 
 /// What a loss changes by when a gate's weights do.
 #[derive(Debug)]
 pub struct GateGradient<T> {
-    pub hidden: LinearGradient<T>,
-    pub output: LinearGradient<T>,
+    hidden: LinearGradient<T>,
+    output: SparseGradient<T>,
 }
 
-/// What the passes over a gate leave for each other.
+/// What the passes over a gate leave for each other. A part of s stands where its blocks would in `[blocks, R, O']`, row by row.
 #[derive(Debug)]
 pub struct GateTape<T> {
+    /// K.
+    hidden: usize,
+    /// O'.
     width: usize,
-    /// h and ḣ, `[2 R, width]`.
+    /// h and ḣ, `[2 R, K]`.
     h: Aligned<T>,
-    /// ĥ and h̄, `[2 R, width]`.
+    /// Where h is not zero.
+    open: Open,
+    /// ĥ and h̄, `[2 R, K]`.
     h_adjoint: Aligned<T>,
-    /// First s - b₂, then σ(s): for each part `[R, its outputs]`.
+    /// First s, then σ(s).
     out: Aligned<T>,
-    /// ṡ, likewise.
     s_dot: Aligned<T>,
 }
 
 impl<T: Real> GateTape<T> {
-    pub fn out(&self, rows: usize, part: &Range<usize>) -> &[T] {
-        &self.out[rows * part.start..rows * part.end]
+    pub fn out(&self, part: &Part<'_>) -> &[T] {
+        &self.out[self.place(part)]
     }
 
-    pub fn s_dot(&self, rows: usize, part: &Range<usize>) -> &[T] {
-        &self.s_dot[rows * part.start..rows * part.end]
+    pub fn s_dot(&self, part: &Part<'_>) -> &[T] {
+        &self.s_dot[self.place(part)]
+    }
+
+    fn place(&self, part: &Part<'_>) -> Range<usize> {
+        let size = part.rows * self.width;
+        part.blocks.start * size..part.blocks.end * size
     }
 }
 
 impl<T: Real> Gate<T> {
-    pub fn named(name: &str, weights: &impl Weights<T>) -> Self {
-        let [hidden, output] = ["hidden", "output"].map(|layer| Linear::named(&format!("{name}.{layer}"), weights));
-        Self { hidden, output }
+    /// The gate of this name in a checkpoint, of blocks of O = `outputs`.
+    pub fn named(name: &str, weights: &impl Weights<T>, outputs: usize) -> Self {
+        let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("{name}.output.{part}")));
+        Self { hidden: Linear::named(&format!("{name}.hidden"), weights), output: Sparse::new(&weight, &bias, outputs) }
     }
 
     pub fn gradient(&self) -> GateGradient<T> {
         GateGradient { hidden: self.hidden.gradient(), output: self.output.gradient() }
     }
 
+    /// A gradient by the names of the weights.
+    pub fn in_weights(&self, name: &str, gradient: &GateGradient<T>) -> Vec<(String, Vec<T>)> {
+        let mut weights = gradient.hidden.in_weights(&format!("{name}.hidden"));
+        let [weight, bias] = self.output.in_weights(&gradient.output);
+        weights.extend([(format!("{name}.output.weight"), weight), (format!("{name}.output.bias"), bias)]);
+        weights
+    }
+
     pub fn tape(&self, rows: usize) -> GateTape<T> {
-        let (width, outputs) = (self.hidden.outputs, self.output.outputs);
+        let (hidden, width) = (self.hidden.outputs, self.output.width);
+        let size = rows * self.output.blocks() * width;
         GateTape {
+            hidden,
             width,
-            h: zeros(2 * rows * width),
-            h_adjoint: zeros(2 * rows * width),
-            out: zeros(rows * outputs),
-            s_dot: zeros(rows * outputs),
+            h: zeros(2 * rows * hidden),
+            open: Open::new(),
+            h_adjoint: zeros(2 * rows * hidden),
+            out: zeros(size),
+            s_dot: zeros(size),
         }
     }
 
-    /// All that it attenuates.
-    pub fn all(&self) -> Range<usize> {
-        self.output.all()
+    /// O'.
+    pub fn width(&self) -> usize {
+        self.output.width
     }
 
-    /// The fewest outputs whose multiples make parts.
-    pub fn granule(&self) -> usize {
-        self.output.granule()
-    }
-
-    /// b₂ of a part.
-    pub fn bias(&self, part: &Range<usize>) -> &[T] {
-        &self.output.bias()[part.clone()]
+    /// Blocks whose weights stay in the nearest cache from one row to the next.
+    pub fn part(&self) -> usize {
+        (PART / (self.output.inputs * self.output.width)).max(1)
     }
 
     /// Before any [`Self::forward`]: leaves h of x `[R, inputs]` on the tape.
     pub fn enter(&self, rows: usize, x: &[T], tape: &mut GateTape<T>) {
-        let h = &mut tape.h[..rows * tape.width];
+        let h = &mut tape.h[..rows * tape.hidden];
         self.hidden.forward(x, h);
         rectify(h);
+        tape.open.find(h, tape.hidden, tape.hidden, tape.hidden);
     }
 
-    /// Leaves s - b₂ on the tape: who goes on from there adds b₂ on the way.
-    pub fn forward<'a>(&self, rows: usize, part: &Range<usize>, tape: &'a mut GateTape<T>) -> &'a mut [T] {
-        let out = &mut tape.out[rows * part.start..rows * part.end];
-        self.output.tangent(part.clone(), &tape.h[..rows * tape.width], out);
+    /// Leaves s on the tape, for somebody to make σ(s) of it.
+    pub fn forward<'a>(&self, part: &Part<'_>, tape: &'a mut GateTape<T>) -> &'a mut [T] {
+        let place = tape.place(part);
+        let out = &mut tape.out[place];
+        self.output.forward(part, &tape.open, &tape.h, out);
         out
     }
 
     /// Before any [`Self::tangent`]: leaves ḣ of ẋ `[R, inputs]` on the tape.
     pub fn enter_tangent(&self, rows: usize, x_dot: &[T], tape: &mut GateTape<T>) {
-        let (h, h_dot) = tape.h[..2 * rows * tape.width].split_at_mut(rows * tape.width);
-        self.hidden.tangent(self.hidden.all(), x_dot, h_dot);
-        mask(h_dot, h);
+        let h_dot = &mut tape.h[rows * tape.hidden..2 * rows * tape.hidden];
+        self.hidden.tangent(x_dot, h_dot);
     }
 
     /// Leaves ṡ on the tape.
-    pub fn tangent(&self, rows: usize, part: &Range<usize>, tape: &mut GateTape<T>) {
-        let h_dot = &tape.h[rows * tape.width..2 * rows * tape.width];
-        self.output.tangent(part.clone(), h_dot, &mut tape.s_dot[rows * part.start..rows * part.end]);
+    pub fn tangent(&self, part: &Part<'_>, tape: &mut GateTape<T>) {
+        let place = tape.place(part);
+        let h_dot = &tape.h[part.rows * tape.hidden..];
+        self.output.tangent(part, &tape.open, h_dot, &mut tape.s_dot[place]);
     }
 
     /// Adds up h̄ from s̄ of a part, the first of which begins anew.
-    pub fn backward(&self, rows: usize, part: &Range<usize>, s_bar: &[T], tape: &mut GateTape<T>) {
-        let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
-        self.output.backward(part.start > 0, part.clone(), s_bar, h_bar);
+    pub fn backward(&self, part: &Part<'_>, s_bar: &[T], sums: &mut Aligned<T>, tape: &mut GateTape<T>) {
+        let size = part.rows * tape.hidden;
+        self.output.backward(part, &tape.open, s_bar, sums, &mut tape.h_adjoint[size..2 * size]);
     }
 
     /// After every [`Self::backward`]: adds to x̄ what h̄ gives.
-    pub fn leave_backward(&self, rows: usize, tape: &mut GateTape<T>, x_bar: &mut [T]) {
-        let h_bar = &mut tape.h_adjoint[rows * tape.width..2 * rows * tape.width];
-        mask(h_bar, &tape.h[..rows * tape.width]);
-        self.hidden.backward(true, self.hidden.all(), h_bar, x_bar);
+    pub fn leave_backward(&self, rows: usize, tape: &GateTape<T>, x_bar: &mut [T]) {
+        let h_bar = &tape.h_adjoint[rows * tape.hidden..2 * rows * tape.hidden];
+        self.hidden.add_backward(h_bar, x_bar);
     }
 
-    /// Adds up ĥ, and adds to the gradient, what `s`, ŝ of a part and in the second order s̄ after it, gives.
+    /// Adds up ĥ, and adds to the gradient, what ŝ of a part and in the second order s̄ give.
     pub fn adjoint(
         &self,
-        rows: usize,
-        part: &Range<usize>,
-        s: &[T],
+        part: &Part<'_>,
+        (s_hat, s_bar): (&[T], Option<&[T]>),
+        sums: &mut Aligned<T>,
         tape: &mut GateTape<T>,
         gradient: &mut GateGradient<T>,
     ) {
-        let stacked = s.len() / part.len() * tape.width;
-        let h_hat = &mut tape.h_adjoint[..rows * tape.width];
-        self.output.accumulate_all(part.clone(), rows, (&tape.h[..stacked], s), &mut gradient.output);
-        self.output.backward(part.start > 0, part.clone(), &s[..rows * part.len()], h_hat);
+        let size = part.rows * tape.hidden;
+        let (h, h_dot) = tape.h.split_at(size);
+        let second = s_bar.map(|s_bar| (h_dot, s_bar));
+        self.output.accumulate(part, &tape.open, (h, s_hat), second, &mut gradient.output);
+        self.output.backward(part, &tape.open, s_hat, sums, &mut tape.h_adjoint[..size]);
     }
 
     /// After every [`Self::adjoint`]: adds to x̂, and to the gradient, what ĥ and in the second order h̄ give; `x` holds x and
@@ -142,57 +165,21 @@ impl<T: Real> Gate<T> {
         &self,
         rows: usize,
         x: &[T],
-        tape: &mut GateTape<T>,
+        tape: &GateTape<T>,
         x_hat: &mut [T],
         gradient: &mut GateGradient<T>,
     ) {
-        let (size, stacked) = (rows * tape.width, x.len() / self.hidden.inputs * tape.width);
-        let h_hat = &mut tape.h_adjoint[..size];
-        mask(h_hat, &tape.h[..size]);
-        self.hidden.backward(true, self.hidden.all(), h_hat, x_hat);
-        self.hidden.accumulate_all(self.hidden.all(), rows, (x, &tape.h_adjoint[..stacked]), &mut gradient.hidden);
+        let stacked = x.len() / self.hidden.inputs;
+        let h_adjoint = &tape.h_adjoint[..stacked * tape.hidden];
+        self.hidden.add_backward(&h_adjoint[..rows * tape.hidden], x_hat);
+        self.hidden.accumulate_all(rows, (x, h_adjoint), &mut gradient.hidden);
     }
 }
 
-/// relu(x), in place. What is not a number stays so, for somebody to see.
-pub fn rectify<T: Real>(x: &mut [T]) {
-    Arch::new().dispatch(Rectify { x });
-}
-
-/// The derivative of [`rectify`] times `x`, where `rectified` is what it left.
-pub fn mask<T: Real>(x: &mut [T], rectified: &[T]) {
-    Arch::new().dispatch(Mask { x, rectified });
-}
-
-#[derive(Debug)]
-struct Rectify<'a, T> {
-    x: &'a mut [T],
-}
-
-impl<T: Real> WithSimd for Rectify<'_, T> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        for x in self.x {
-            *x = if *x < T::ZERO { T::ZERO } else { *x };
-        }
-    }
-}
-
-#[derive(Debug)]
-struct Mask<'a, T> {
-    x: &'a mut [T],
-    rectified: &'a [T],
-}
-
-impl<T: Real> WithSimd for Mask<'_, T> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        for (x, rectified) in self.x.iter_mut().zip(self.rectified) {
-            *x = if *rectified > T::ZERO { *x } else { T::ZERO };
-        }
+impl<T: Real> GateGradient<T> {
+    /// Adds another.
+    pub fn add(&mut self, other: &Self) {
+        self.hidden.add(&other.hidden);
+        self.output.add(&other.output);
     }
 }

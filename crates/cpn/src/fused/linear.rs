@@ -6,7 +6,6 @@ use super::matrix::{Matrix, Panels};
 use super::product::{Left, multiply};
 use super::real::Real;
 use pulp::{Arch, Simd, WithSimd};
-use std::ops::Range;
 
 /// Weights by their names in a checkpoint.
 pub trait Weights<T> {
@@ -46,40 +45,33 @@ impl<T: Real, E: Factor<Sum = T>> Linear<E, T> {
         Self { inputs, outputs, weight, transposed, bias }
     }
 
-    /// The fewest outputs of which a multiple may be computed without the others.
-    pub fn granule(&self) -> usize {
-        Panels::<E>::width()
-    }
-
     /// y = a x + b: x `[R, inputs]`, along its rows, to y `[R, outputs]`.
     pub fn forward(&self, x: &[E], y: &mut [T]) {
         for row in y.chunks_exact_mut(self.outputs) {
             row.copy_from_slice(&self.bias);
         }
-        multiply(true, y, Left::Rows(x), self.transposed.matrix(self.all()));
+        multiply(true, y, Left::Rows(x), self.transposed.matrix());
     }
 
-    /// All of its outputs.
-    pub fn all(&self) -> Range<usize> {
-        0..self.outputs
+    /// ẏ = a ẋ: how y changes as x does.
+    pub fn tangent(&self, x_dot: &[E], y_dot: &mut [T]) {
+        multiply(false, y_dot, Left::Rows(x_dot), self.transposed.matrix());
     }
 
-    /// ẏ = a ẋ: how some outputs change as x does.
-    pub fn tangent(&self, outputs: Range<usize>, x_dot: &[E], y_dot: &mut [T]) {
-        multiply(false, y_dot, Left::Rows(x_dot), self.transposed.matrix(outputs));
+    /// x̄ = aᵀ ȳ: how a loss changes with x, from how it changes with y.
+    pub fn backward(&self, y_bar: &[E], x_bar: &mut [T]) {
+        multiply(false, x_bar, Left::Rows(y_bar), Matrix::new(&self.weight, self.inputs));
     }
 
-    /// x̄ = aᵀ ȳ, added to what is in x̄ if `accumulate`: how a loss changes with x, from how it changes with some outputs.
-    pub fn backward(&self, accumulate: bool, outputs: Range<usize>, y_bar: &[E], x_bar: &mut [T]) {
-        let weight = &self.weight[outputs.start * self.inputs / E::NUMBERS..outputs.end * self.inputs / E::NUMBERS];
-        multiply(accumulate, x_bar, Left::Rows(y_bar), Matrix::new(weight, self.inputs));
+    /// The same, added to what is in x̄.
+    pub fn add_backward(&self, y_bar: &[E], x_bar: &mut [T]) {
+        multiply(true, x_bar, Left::Rows(y_bar), Matrix::new(&self.weight, self.inputs));
     }
 
-    /// Adds ∂Φ/∂a to `gradient`, for Φ = ŷᵀy + ȳᵀẏ over some outputs. `x` and `y` hold, across their rows, those of x and ŷ and,
-    /// in the second order, those of ẋ and ȳ after them.
-    pub fn accumulate(&self, outputs: Range<usize>, (x, y): (&[E], &[E]), gradient: &mut LinearGradient<T>) {
-        let weight = &mut gradient.weight[outputs.start * self.inputs..outputs.end * self.inputs];
-        multiply(true, weight, Left::Turned(y), Matrix::new(x, self.inputs));
+    /// Adds ∂Φ/∂a to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold, across their rows, those of x and ŷ and, in the second order,
+    /// those of ẋ and ȳ after them.
+    pub fn accumulate(&self, (x, y): (&[E], &[E]), gradient: &mut LinearGradient<T>) {
+        multiply(true, &mut gradient.weight, Left::Turned(y), Matrix::new(x, self.inputs));
     }
 
     /// A gradient of zeros.
@@ -94,34 +86,18 @@ impl<T: Real> Linear<T> {
         Self::new(&weights.get(&format!("{name}.weight")), weights.get(&format!("{name}.bias")))
     }
 
-    /// a `[outputs, inputs]`.
-    pub fn weight(&self) -> &[T] {
-        &self.weight
-    }
-
-    /// b `[outputs]`.
-    pub fn bias(&self) -> &[T] {
-        &self.bias
-    }
-
     /// [`Self::accumulate`], and ∂Φ/∂b, which the first R = `rows` of them make.
-    pub fn accumulate_all(
-        &self,
-        outputs: Range<usize>,
-        rows: usize,
-        (x, y): (&[T], &[T]),
-        gradient: &mut LinearGradient<T>,
-    ) {
-        self.accumulate(outputs.clone(), (x, y), gradient);
-        gradient.add_bias(outputs.clone(), &y[..rows * outputs.len()]);
+    pub fn accumulate_all(&self, rows: usize, (x, y): (&[T], &[T]), gradient: &mut LinearGradient<T>) {
+        self.accumulate((x, y), gradient);
+        gradient.add_bias(&y[..rows * self.outputs]);
     }
 }
 
 impl<T: Real> LinearGradient<T> {
-    /// Adds ∂Φ/∂b, from the rows of ŷ, over some outputs.
-    pub fn add_bias(&mut self, outputs: Range<usize>, y: &[T]) {
-        for row in y.chunks_exact(outputs.len()) {
-            add(&mut self.bias[outputs.clone()], row);
+    /// Adds ∂Φ/∂b, from the rows of ŷ.
+    pub fn add_bias(&mut self, y: &[T]) {
+        for row in y.chunks_exact(self.bias.len()) {
+            add(&mut self.bias, row);
         }
     }
 
@@ -131,9 +107,9 @@ impl<T: Real> LinearGradient<T> {
         add(&mut self.bias, &other.bias);
     }
 
-    /// Both tensors, by their names in a checkpoint.
-    pub fn tensors(&mut self, name: &str) -> Vec<(String, &mut Aligned<T>)> {
-        vec![(format!("{name}.weight"), &mut self.weight), (format!("{name}.bias"), &mut self.bias)]
+    /// By the names of the weights.
+    pub fn in_weights(&self, name: &str) -> Vec<(String, Vec<T>)> {
+        vec![(format!("{name}.weight"), self.weight.to_vec()), (format!("{name}.bias"), self.bias.to_vec())]
     }
 }
 

@@ -4,7 +4,6 @@ use super::factor::Factor;
 use super::lanes::{Aligned, zeros};
 use pulp::{Simd, WithSimd};
 use std::marker::PhantomData;
-use std::ops::Range;
 
 /// Registers side by side in a panel.
 pub const REGISTERS: usize = 2;
@@ -75,16 +74,15 @@ impl<E: Factor> Panels<E> {
     }
 
     /// Columns of a panel.
-    pub fn width() -> usize {
+    fn width() -> usize {
         REGISTERS * Shape::of::<E>().lanes
     }
 
-    /// Some columns, from a panel's first on, for a product.
-    pub fn matrix(&self, columns: Range<usize>) -> Matrix<'_, E> {
-        let (inner, stride) = (self.inner, Self::width());
-        assert!(columns.start.is_multiple_of(stride) && columns.end <= self.columns, "columns of some panels");
-        let values = &self.values[columns.start * inner..];
-        Matrix { values, inner, columns: columns.len(), stride, side_by_side: REGISTERS, in_panels: true, whole: inner }
+    /// All of it, for a product.
+    pub fn matrix(&self) -> Matrix<'_, E> {
+        let &Self { ref values, inner, columns } = self;
+        let (stride, side_by_side) = (Self::width(), REGISTERS);
+        Matrix { values, inner, columns, stride, side_by_side, in_panels: true, whole: inner }
     }
 }
 

@@ -17,6 +17,7 @@
 //! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
 //! ([`Embedder`]). Tested against autograd in float64 (`tests/fused.rs`).
 
+mod attenuated;
 mod convolution;
 mod dense;
 mod embedder;
@@ -37,7 +38,9 @@ mod planner;
 mod product;
 mod readout;
 mod real;
+mod rectified;
 mod sampling;
+mod sparse;
 mod tiles;
 mod winograd;
 
@@ -119,8 +122,8 @@ impl<T: Real> OuterLoop<T> {
         });
         let mut parts = self.workers.iter_mut().filter_map(|worker| worker.sums.take());
         let mut sums = parts.next().unwrap_or_else(|| Sums::zeros(&network));
-        parts.for_each(|part| sums.add(part));
-        OuterGradient { loss: sums.loss, x, x_g, weights: sums.into_weights(updates > 0) }
+        parts.for_each(|part| sums.add(&part));
+        OuterGradient { loss: sums.loss, x, x_g, weights: sums.in_weights(&network, updates > 0) }
     }
 }
 

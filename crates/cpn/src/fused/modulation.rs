@@ -1,44 +1,21 @@
-//! What the passes over a neuromodulated layer do for each weight. The formulas stand in [`gated`](super::gated).
+//! What the passes over attenuated weights do for each of them. The formulas stand in [`gated`](super::gated).
 //!
-//! Each kernel runs over R samples and some of the outputs; `a` is `[outputs, inputs]`, what belongs to u is `[R, some outputs,
-//! inputs]`, the rest `[R, inputs]` or `[R, outputs]`.
+//! Each kernel runs over R samples and a part of the inputs; `a` is `[inputs, O']`, what belongs to u is `[R, some inputs, O']`,
+//! the rest `[R, inputs]` or `[R, O]`.
 
+use super::attenuated::Attenuated;
 use super::lanes::{Lanes, registers, registers_mut};
-use super::linear::{Linear, LinearGradient};
 use super::real::Real;
+use super::sparse::Part;
 use pulp::{Simd, WithSimd};
-use std::ops::Range;
 
-/// σ(s) of s - b₂, row by row.
-#[derive(Debug)]
-pub struct Sigmoid<'a, T> {
-    pub s: &'a mut [T],
-    pub bias: &'a [T],
-}
-
-impl<T: Real> WithSimd for Sigmoid<'_, T> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let count = Lanes::<S, T>::COUNT;
-        for row in self.s.chunks_exact_mut(self.bias.len()) {
-            for (s, bias) in row.chunks_mut(count).zip(self.bias.chunks(count)) {
-                (Lanes::load(simd, s) + Lanes::load(simd, bias)).sigmoid().store(s);
-            }
-        }
-    }
-}
-
-/// Some of y; turns s - b₂ into u on the way.
+/// Adds to y; turns s into u on the way.
 #[derive(Debug)]
 pub struct Forward<'a, T> {
-    pub linear: &'a Linear<T>,
-    pub outputs: Range<usize>,
-    pub u_bias: &'a [T],
+    pub layer: &'a Attenuated<T>,
+    pub part: &'a Part<'a>,
     pub x: &'a [T],
     pub u: &'a mut [T],
-    pub v: &'a [T],
     pub y: &'a mut [T],
 }
 
@@ -46,108 +23,89 @@ impl<T: Real> WithSimd for Forward<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, u_bias, x, u, v, y } = self;
-        let Linear { inputs, outputs, .. } = *linear;
-        let weight = &linear.weight()[part.start * inputs..];
-        for (r, x) in x.chunks_exact(inputs).enumerate() {
-            for (j, o) in part.clone().enumerate() {
-                let at = r * outputs + o;
-                let u = &mut u[(r * part.len() + j) * inputs..][..inputs];
-                let row = j * inputs..(j + 1) * inputs;
-                let (u_bias, a) = (&u_bias[row.clone()], &weight[row]);
-                let sum = open(simd, u, [u_bias, a, x]);
-                y[at] = sum.sum() + v[at] * linear.bias()[o];
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
+        outputs(simd, &mut self, rows, registers);
+    }
+}
+
+impl<S: Simd, T: Real> Outputs<S> for Forward<'_, T> {
+    #[inline(always)]
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+        let Self { layer, part, x, u, y } = self;
+        let Attenuated { inputs, outputs, ref a, .. } = **layer;
+        let (x, y, width) = (&x[r * inputs..][..inputs], &mut y[r * outputs..][..outputs], layer.width());
+        let mut sums = load::<S, T, W>(simd, y, at);
+        for i in part.wanted(r) {
+            let [a] = line::<S, T, W, 1>(simd, [&a[i * width..]], at);
+            let [u] = line_mut::<S, T, W, 1>(simd, [&mut u[part.at(r, i, width)..]], at);
+            let x = Lanes::splat(simd, x[i]);
+            for (w, sum) in sums.iter_mut().enumerate() {
+                let [s, a] = Lanes::each(simd, [u[w], a[w]]);
+                let open = s.sigmoid();
+                u[w] = open.values();
+                *sum = (open * a).mul_add(x, *sum);
             }
         }
+        store(sums, y, at);
     }
 }
 
-/// Turns a row of s - b₂ into u, and answers Σ u a x, yet to be summed over the lanes.
-#[inline(always)]
-fn open<S: Simd, T: Real>(simd: S, u: &mut [T], [bias, a, x]: [&[T]; 3]) -> Lanes<S, T> {
-    let mut sum = Lanes::splat(simd, T::ZERO);
-    let count = u.len() / Lanes::<S, T>::COUNT;
-    {
-        // Slices of registers, all as long, are read without looking for their ends each time.
-        let [u] = registers_mut(simd, [&mut *u], count);
-        let [bias, a, x] = registers(simd, [bias, a, x], count);
-        for i in 0..count {
-            u[i] = open_lanes(Lanes::each(simd, [u[i], bias[i], a[i], x[i]]), &mut sum).values();
-        }
-    }
-    let rest = count * Lanes::<S, T>::COUNT..u.len();
-    if !rest.is_empty() {
-        let rows = [&u[rest.clone()], &bias[rest.clone()], &a[rest.clone()], &x[rest.clone()]];
-        open_lanes(Lanes::load_each(simd, rows), &mut sum).store(&mut u[rest]);
-    }
-    sum
-}
-
-#[inline(always)]
-fn open_lanes<S: Simd, T: Real>([s, bias, a, x]: [Lanes<S, T>; 4], sum: &mut Lanes<S, T>) -> Lanes<S, T> {
-    let open = (s + bias).sigmoid();
-    *sum = (open * a).mul_add(x, *sum);
-    open
-}
-
-/// Adds to x̄; s̄ of both gates.
+/// Adds to x̄; s̄.
 #[derive(Debug)]
 pub struct Backward<'a, T> {
-    pub linear: &'a Linear<T>,
-    pub outputs: Range<usize>,
+    pub layer: &'a Attenuated<T>,
+    pub part: &'a Part<'a>,
     pub x: &'a [T],
     pub u: &'a [T],
-    pub v: &'a [T],
     pub y_bar: &'a [T],
     pub x_bar: &'a mut [T],
-    pub s_u: &'a mut [T],
-    pub s_v: &'a mut [T],
+    pub s_bar: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for Backward<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, x, u, v, y_bar, x_bar, s_u, s_v } = self;
-        let Linear { inputs, outputs, .. } = *linear;
-        let one = Lanes::splat(simd, T::ONE);
-        let weight = &linear.weight()[part.start * inputs..];
-        for (r, x) in x.chunks_exact(inputs).enumerate() {
-            let block = r * part.len() * inputs;
-            let y_bar = &y_bar[r * outputs..][part.clone()];
-            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                let x_bar = &mut x_bar[r * inputs..][i..inputs];
-                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_bar));
-                for (j, y) in y_bar.iter().enumerate() {
-                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
-                    let open = Lanes::splat(simd, *y) * u * a;
-                    sum = sum + open;
-                    (open * (one - u) * x).store(&mut s_u[block..][from..to]);
-                }
-                sum.store(x_bar);
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
+        outputs(simd, &mut self, rows, registers);
+    }
+}
+
+impl<S: Simd, T: Real> Outputs<S> for Backward<'_, T> {
+    #[inline(always)]
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+        let Self { layer, part, x, u, y_bar, x_bar, s_bar } = self;
+        let Attenuated { inputs, outputs, ref a, .. } = **layer;
+        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
+        let y_bar = load::<S, T, W>(simd, &y_bar[r * outputs..][..outputs], at);
+        let (x, x_bar) = (&x[r * inputs..][..inputs], &mut x_bar[r * inputs..][..inputs]);
+        for i in part.wanted(r) {
+            let place = part.at(r, i, width);
+            let [u, a] = line::<S, T, W, 2>(simd, [&u[place..], &a[i * width..]], at);
+            let [s_bar] = line_mut::<S, T, W, 1>(simd, [&mut s_bar[place..]], at);
+            let (x, mut sum) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, T::ZERO));
+            for (w, y_bar) in y_bar.into_iter().enumerate() {
+                let [u, a] = Lanes::each(simd, [u[w], a[w]]);
+                let open = y_bar * u * a;
+                sum = sum + open;
+                s_bar[w] = (open * (one - u) * x).values();
             }
-            for (o, y_bar) in part.clone().zip(y_bar) {
-                let at = r * outputs + o;
-                s_v[at] = *y_bar * linear.bias()[o] * v[at] * (T::ONE - v[at]);
-            }
+            x_bar[i] += sum.sum();
         }
     }
 }
 
-/// ẏ.
+/// Adds to ẏ.
 #[derive(Debug)]
 pub struct Tangent<'a, T> {
-    pub linear: &'a Linear<T>,
-    pub outputs: Range<usize>,
+    pub layer: &'a Attenuated<T>,
+    pub part: &'a Part<'a>,
     pub x: &'a [T],
     pub x_dot: &'a [T],
     pub u: &'a [T],
-    pub v: &'a [T],
-    pub s_dot_u: &'a [T],
-    pub s_dot_v: &'a [T],
+    pub s_dot: &'a [T],
     pub y_dot: &'a mut [T],
 }
 
@@ -155,142 +113,203 @@ impl<T: Real> WithSimd for Tangent<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, x, x_dot, u, v, s_dot_u, s_dot_v, y_dot } = self;
-        let Linear { inputs, outputs, .. } = *linear;
-        let one = Lanes::splat(simd, T::ONE);
-        for r in 0..x.len() / inputs {
-            let row = r * inputs..(r + 1) * inputs;
-            let (x, x_dot) = (&x[row.clone()], &x_dot[row]);
-            for (j, o) in part.clone().enumerate() {
-                let (at, place) = (r * outputs + o, (r * part.len() + j) * inputs);
-                let a = &linear.weight()[o * inputs..][..inputs];
-                let (u, s_dot) = (&u[place..][..inputs], &s_dot_u[place..][..inputs]);
-                let mut sum = Lanes::splat(simd, T::ZERO);
-                for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                    let [u, s_dot, a] = Lanes::load_each(simd, [&u[i..], &s_dot[i..], &a[i..]]);
-                    let [x, x_dot] = Lanes::load_each(simd, [&x[i..], &x_dot[i..]]);
-                    sum = (a * u).mul_add(((one - u) * s_dot).mul_add(x, x_dot), sum);
-                }
-                y_dot[at] = sum.sum() + v[at] * (T::ONE - v[at]) * s_dot_v[at] * linear.bias()[o];
-            }
-        }
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
+        outputs(simd, &mut self, rows, registers);
     }
 }
 
-/// Adds to x̂ and to the gradient; ŝ of both gates: the terms of ŷ.
+impl<S: Simd, T: Real> Outputs<S> for Tangent<'_, T> {
+    #[inline(always)]
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+        let Self { layer, part, x, x_dot, u, s_dot, y_dot } = self;
+        let Attenuated { inputs, outputs, ref a, .. } = **layer;
+        let (y_dot, width, one) = (&mut y_dot[r * outputs..][..outputs], layer.width(), Lanes::splat(simd, T::ONE));
+        let [x, x_dot] = [*x, *x_dot].map(|x| &x[r * inputs..][..inputs]);
+        let mut sums = load::<S, T, W>(simd, y_dot, at);
+        for i in part.wanted(r) {
+            let place = part.at(r, i, width);
+            let [u, s_dot, a] = line::<S, T, W, 3>(simd, [&u[place..], &s_dot[place..], &a[i * width..]], at);
+            let (x, x_dot) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, x_dot[i]));
+            for (w, sum) in sums.iter_mut().enumerate() {
+                let [u, s_dot, a] = Lanes::each(simd, [u[w], s_dot[w], a[w]]);
+                *sum = (a * u).mul_add(((one - u) * s_dot).mul_add(x, x_dot), *sum);
+            }
+        }
+        store(sums, y_dot, at);
+    }
+}
+
+/// Adds to x̂ and to the gradient; ŝ: the terms of ŷ.
 #[derive(Debug)]
 pub struct FirstAdjoint<'a, T> {
-    pub linear: &'a Linear<T>,
-    pub outputs: Range<usize>,
+    pub layer: &'a Attenuated<T>,
+    pub part: &'a Part<'a>,
     pub x: &'a [T],
     pub u: &'a [T],
-    pub v: &'a [T],
     pub y_hat: &'a [T],
     pub x_hat: &'a mut [T],
-    pub s_u: &'a mut [T],
-    pub s_v: &'a mut [T],
-    pub gradient: &'a mut LinearGradient<T>,
+    pub s_hat: &'a mut [T],
+    pub in_a: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for FirstAdjoint<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, x, u, v, y_hat, x_hat, s_u, s_v, gradient } = self;
-        let Linear { inputs, outputs, .. } = *linear;
-        let one = Lanes::splat(simd, T::ONE);
-        let weights = part.start * inputs..part.end * inputs;
-        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
-        for (r, x) in x.chunks_exact(inputs).enumerate() {
-            let block = r * weights.len();
-            let y_hat = &y_hat[r * outputs..][part.clone()];
-            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                let x_hat = &mut x_hat[r * inputs..][i..inputs];
-                let (x, mut sum) = (Lanes::load(simd, &x[i..]), Lanes::load(simd, x_hat));
-                for (j, y) in y_hat.iter().enumerate() {
-                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, a] = Lanes::load_each(simd, [&u[block..][from..to], &weight[from..to]]);
-                    let open = Lanes::splat(simd, *y) * u;
-                    sum = open.mul_add(a, sum);
-                    (open * x).add_to(&mut in_weight[from..to]);
-                    (open * (one - u) * a * x).store(&mut s_u[block..][from..to]);
-                }
-                sum.store(x_hat);
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
+        outputs(simd, &mut self, rows, registers);
+    }
+}
+
+impl<S: Simd, T: Real> Outputs<S> for FirstAdjoint<'_, T> {
+    #[inline(always)]
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+        let Self { layer, part, x, u, y_hat, x_hat, s_hat, in_a } = self;
+        let Attenuated { inputs, outputs, ref a, .. } = **layer;
+        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
+        let y_hat = load::<S, T, W>(simd, &y_hat[r * outputs..][..outputs], at);
+        let (x, x_hat) = (&x[r * inputs..][..inputs], &mut x_hat[r * inputs..][..inputs]);
+        for i in part.wanted(r) {
+            let place = part.at(r, i, width);
+            let [u, a] = line::<S, T, W, 2>(simd, [&u[place..], &a[i * width..]], at);
+            let [s_hat, in_a] = line_mut::<S, T, W, 2>(simd, [&mut s_hat[place..], &mut in_a[i * width..]], at);
+            let (x, mut sum) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, T::ZERO));
+            for (w, y_hat) in y_hat.into_iter().enumerate() {
+                let [u, a, in_weight] = Lanes::each(simd, [u[w], a[w], in_a[w]]);
+                let open = y_hat * u;
+                sum = open.mul_add(a, sum);
+                let open = open * x;
+                in_a[w] = (in_weight + open).values();
+                s_hat[w] = (open * (one - u) * a).values();
             }
-            for (o, y_hat) in part.clone().zip(y_hat) {
-                let at = r * outputs + o;
-                let open = *y_hat * v[at];
-                gradient.bias[o] += open;
-                s_v[at] = open * (T::ONE - v[at]) * linear.bias()[o];
-            }
+            x_hat[i] += sum.sum();
         }
     }
 }
 
-/// Adds to x̂ and to the gradient; ŝ and s̄ of both gates: the terms of ŷ and of ȳ.
+/// Adds to x̂ and to the gradient; ŝ and s̄: the terms of ŷ and of ȳ.
 #[derive(Debug)]
 pub struct SecondAdjoint<'a, T> {
-    pub linear: &'a Linear<T>,
-    pub outputs: Range<usize>,
+    pub layer: &'a Attenuated<T>,
+    pub part: &'a Part<'a>,
     /// x and ẋ.
-    pub x: (&'a [T], &'a [T]),
+    pub xs: (&'a [T], &'a [T]),
     pub u: &'a [T],
-    pub v: &'a [T],
-    pub s_dot_u: &'a [T],
-    pub s_dot_v: &'a [T],
+    pub s_dot: &'a [T],
     /// ŷ and ȳ.
-    pub y: (&'a [T], &'a [T]),
+    pub ys: (&'a [T], &'a [T]),
     pub x_hat: &'a mut [T],
     /// ŝ and s̄.
-    pub s_u: (&'a mut [T], &'a mut [T]),
-    pub s_v: (&'a mut [T], &'a mut [T]),
-    pub gradient: &'a mut LinearGradient<T>,
+    pub ss: (&'a mut [T], &'a mut [T]),
+    pub in_a: &'a mut [T],
 }
 
 impl<T: Real> WithSimd for SecondAdjoint<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let Self { linear, outputs: part, x: xs, u, v, s_dot_u, s_dot_v, y: ys, x_hat, s_u, s_v, gradient } = self;
-        let Linear { inputs, outputs, .. } = *linear;
-        let one = Lanes::splat(simd, T::ONE);
-        let weights = part.start * inputs..part.end * inputs;
-        let (weight, in_weight) = (&linear.weight()[weights.clone()], &mut gradient.weight[weights.clone()]);
-        for r in 0..xs.0.len() / inputs {
-            let row = r * inputs..(r + 1) * inputs;
-            let (xs, x_hat) = ((&xs.0[row.clone()], &xs.1[row.clone()]), &mut x_hat[row]);
-            let block = r * weights.len();
-            let (y_hat, y_bar) = (&ys.0[r * outputs..][part.clone()], &ys.1[r * outputs..][part.clone()]);
-            for i in (0..inputs).step_by(Lanes::<S, T>::COUNT) {
-                let [x, x_dot, mut sum] = Lanes::load_each(simd, [&xs.0[i..], &xs.1[i..], &x_hat[i..]]);
-                for (j, (y_hat, y_bar)) in y_hat.iter().zip(y_bar).enumerate() {
-                    let (from, to) = (j * inputs + i, (j + 1) * inputs);
-                    let [u, s_dot] = Lanes::load_each(simd, [&u[block..][from..to], &s_dot_u[block..][from..to]]);
-                    let (a, in_a) = (Lanes::load(simd, &weight[from..to]), &mut in_weight[from..to]);
-                    let (y_hat, y_bar) = (Lanes::splat(simd, *y_hat), Lanes::splat(simd, *y_bar));
-                    let shut = one - u;
-                    let slope = u * shut;
-                    let moved = y_bar * s_dot;
-                    let (p, q) = (y_hat.mul_add(x, y_bar * x_dot), moved * x);
-                    sum = a.mul_add(y_hat.mul_add(u, moved * slope), sum);
-                    u.mul_add(p, slope * q).add_to(in_a);
-                    let slope = a * slope;
-                    (slope * (shut - u).mul_add(q, p)).store(&mut s_u.0[block..][from..to]);
-                    (slope * y_bar * x).store(&mut s_u.1[block..][from..to]);
-                }
-                sum.store(&mut x_hat[i..]);
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
+        outputs(simd, &mut self, rows, registers);
+    }
+}
+
+impl<S: Simd, T: Real> Outputs<S> for SecondAdjoint<'_, T> {
+    #[inline(always)]
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+        let Self { layer, part, xs, u, s_dot, ys, x_hat, ss, in_a } = self;
+        let Attenuated { inputs, outputs, ref a, .. } = **layer;
+        let (width, one) = (layer.width(), Lanes::splat(simd, T::ONE));
+        let y_hat = load::<S, T, W>(simd, &ys.0[r * outputs..][..outputs], at);
+        let y_bar = load::<S, T, W>(simd, &ys.1[r * outputs..][..outputs], at);
+        let [x, x_dot] = [xs.0, xs.1].map(|x| &x[r * inputs..][..inputs]);
+        let x_hat = &mut x_hat[r * inputs..][..inputs];
+        for i in part.wanted(r) {
+            let place = part.at(r, i, width);
+            let [u, s_dot, a] = line::<S, T, W, 3>(simd, [&u[place..], &s_dot[place..], &a[i * width..]], at);
+            let to = [&mut ss.0[place..], &mut ss.1[place..], &mut in_a[i * width..]];
+            let [s_hat, s_bar, in_a] = line_mut::<S, T, W, 3>(simd, to, at);
+            let (x, x_dot) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, x_dot[i]));
+            let mut sum = Lanes::splat(simd, T::ZERO);
+            for w in 0..W {
+                let [u, s_dot, a, in_weight] = Lanes::each(simd, [u[w], s_dot[w], a[w], in_a[w]]);
+                let (y_hat, y_bar) = (y_hat[w], y_bar[w]);
+                let shut = one - u;
+                let slope = u * shut;
+                let moved = y_bar * s_dot;
+                let (p, q) = (y_hat.mul_add(x, y_bar * x_dot), moved * x);
+                sum = a.mul_add(y_hat.mul_add(u, moved * slope), sum);
+                in_a[w] = (u.mul_add(p, slope.mul_add(q, in_weight))).values();
+                let slope = a * slope;
+                s_hat[w] = (slope * (shut - u).mul_add(q, p)).values();
+                s_bar[w] = (slope * y_bar * x).values();
             }
-            for (o, (y_hat, y_bar)) in part.clone().zip(y_hat.iter().zip(y_bar)) {
-                let at = r * outputs + o;
-                let (v, b) = (v[at], linear.bias()[o]);
-                let (slope, moved) = (v * (T::ONE - v), *y_bar * s_dot_v[at]);
-                gradient.bias[o] += v * *y_hat + slope * moved;
-                s_v.0[at] = b * slope * (*y_hat + (T::ONE - v - v) * moved);
-                s_v.1[at] = b * slope * *y_bar;
-            }
+            x_hat[i] += sum.sum();
         }
     }
+}
+
+/// What goes through the outputs of each row, W registers of them at a time, and through the inputs for each.
+trait Outputs<S: Simd> {
+    /// Those of row r from register `at` on.
+    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize);
+}
+
+#[inline(always)]
+fn outputs<S: Simd>(simd: S, pass: &mut impl Outputs<S>, rows: usize, registers: usize) {
+    for r in 0..rows {
+        let mut at = 0;
+        while at + 4 <= registers {
+            pass.some::<4>(simd, r, at);
+            at += 4;
+        }
+        while at + 2 <= registers {
+            pass.some::<2>(simd, r, at);
+            at += 2;
+        }
+        while at < registers {
+            pass.some::<1>(simd, r, at);
+            at += 1;
+        }
+    }
+}
+
+/// W registers of a row of O numbers, from register `at` on, with zeros behind its end.
+#[inline(always)]
+fn load<S: Simd, T: Real, const W: usize>(simd: S, row: &[T], at: usize) -> [Lanes<S, T>; W] {
+    let mut values = [Lanes::splat(simd, T::ZERO); W];
+    for (w, values) in values.iter_mut().enumerate() {
+        *values = Lanes::load(simd, &row[(at + w) * Lanes::<S, T>::COUNT..]);
+    }
+    values
+}
+
+/// Writes them over.
+#[inline(always)]
+fn store<S: Simd, T: Real, const W: usize>(values: [Lanes<S, T>; W], row: &mut [T], at: usize) {
+    for (w, values) in values.into_iter().enumerate() {
+        values.store(&mut row[(at + w) * Lanes::<S, T>::COUNT..]);
+    }
+}
+
+/// W registers of each slice, from register `at` on.
+#[inline(always)]
+fn line<S: Simd, T: Real, const W: usize, const N: usize>(
+    simd: S,
+    slices: [&[T]; N],
+    at: usize,
+) -> [&[T::Lanes<S>]; N] {
+    registers(simd, slices, at + W).map(|slice| &slice[at..])
+}
+
+/// The same, to be written.
+#[inline(always)]
+fn line_mut<S: Simd, T: Real, const W: usize, const N: usize>(
+    simd: S,
+    slices: [&mut [T]; N],
+    at: usize,
+) -> [&mut [T::Lanes<S>]; N] {
+    registers_mut(simd, slices, at + W).map(|slice| &mut slice[at..])
 }

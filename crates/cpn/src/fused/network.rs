@@ -1,12 +1,16 @@
 //! g_θ: the four passes over one step of a rollout.
 
+use super::attenuated::Scratch;
 use super::dense::{Dense, DenseGradient, Order, Tape};
-use super::gate::{mask, rectify};
-use super::gated::Scratch;
 use super::lanes::{Aligned, zeros};
 use super::linear::{Weights, add};
 use super::real::Real;
+use super::rectified::{mask, rectify};
 use crate::config::ModelConfig;
+
+/// The layers of both branches.
+const POLICY: [&str; 2] = ["policy_0", "policy_1"];
+const DYNAMICS: [&str; 2] = ["dynamics_0", "dynamics_1"];
 
 /// The network's weights.
 #[derive(Debug)]
@@ -63,15 +67,18 @@ impl<T: Real> Network<T> {
     /// Reads the weights of a model of this configuration.
     pub fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
         let method = config.method;
-        let layer = |name: &str| Dense::named(&format!("network.{name}"), weights, method.is_neuromodulated());
-        let latent = config.encoder.latent() as usize;
+        let (latent, hidden) = (config.encoder.latent() as usize, config.hidden as usize);
+        let layer = |name: &str, rectified| {
+            Dense::named(&format!("network.{name}"), rectified, weights, method.is_neuromodulated())
+        };
+        let behind = |name: &str| layer(name, hidden);
         Self {
-            trunk: layer("trunk"),
-            policy: ["policy_0", "policy_1"].map(layer),
-            dynamics: method.plans().then(|| ["dynamics_0", "dynamics_1"].map(layer)),
+            trunk: layer("trunk", 0),
+            policy: POLICY.map(behind),
+            dynamics: method.plans().then(|| DYNAMICS.map(behind)),
             sizes: Sizes {
                 latent,
-                hidden: config.hidden as usize,
+                hidden,
                 actions: config.actions as usize,
                 seen: if method.is_goal_conditioned() { 2 * latent } else { latent },
             },
@@ -85,6 +92,19 @@ impl<T: Real> Network<T> {
             policy: self.policy.each_ref().map(Dense::gradient),
             dynamics: self.dynamics.as_ref().map(|layers| layers.each_ref().map(Dense::gradient)),
         }
+    }
+
+    /// A gradient by the names of the weights, without `network.` before them.
+    pub fn in_weights(&self, gradient: &NetworkGradient<T>) -> Vec<(String, Vec<T>)> {
+        let mut weights = self.trunk.in_weights("trunk", &gradient.trunk);
+        for ((name, layer), gradient) in POLICY.iter().zip(&self.policy).zip(&gradient.policy) {
+            weights.extend(layer.in_weights(name, gradient));
+        }
+        let dynamics = self.dynamics.iter().flatten().zip(gradient.dynamics.iter().flatten());
+        for (name, (layer, gradient)) in DYNAMICS.iter().zip(dynamics) {
+            weights.extend(layer.in_weights(name, gradient));
+        }
+        weights
     }
 
     /// A step's tape for blocks of up to R = `rows` samples.
@@ -278,16 +298,11 @@ impl<T: Real> Network<T> {
 }
 
 impl<T: Real> NetworkGradient<T> {
-    /// Every tensor, by its name in a checkpoint, without `network.` before it.
-    pub fn tensors(&mut self) -> Vec<(String, &mut Aligned<T>)> {
-        let mut tensors = self.trunk.tensors("trunk");
-        for (i, layer) in self.policy.iter_mut().enumerate() {
-            tensors.extend(layer.tensors(&format!("policy_{i}")));
-        }
-        for (i, layer) in self.dynamics.iter_mut().flatten().enumerate() {
-            tensors.extend(layer.tensors(&format!("dynamics_{i}")));
-        }
-        tensors
+    /// Adds another.
+    pub fn add(&mut self, other: &Self) {
+        let ours = [&mut self.trunk].into_iter().chain(&mut self.policy).chain(self.dynamics.iter_mut().flatten());
+        let others = [&other.trunk].into_iter().chain(&other.policy).chain(other.dynamics.iter().flatten());
+        ours.zip(others).for_each(|(ours, other)| ours.add(other));
     }
 }
 

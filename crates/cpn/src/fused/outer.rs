@@ -82,18 +82,16 @@ impl<T: Real> Sums<T> {
     }
 
     /// Adds those of other rows.
-    pub fn add(&mut self, mut other: Self) {
+    pub fn add(&mut self, other: &Self) {
         self.loss += other.loss;
         self.step_size += other.step_size;
-        for ((_, sum), (_, part)) in self.network.tensors().into_iter().zip(other.network.tensors()) {
-            super::linear::add(sum, part);
-        }
+        self.network.add(&other.network);
     }
 
     /// The gradient by the names of the weights, that in α if it takes part.
-    pub fn into_weights(mut self, with_step_size: bool) -> Vec<(String, Vec<T>)> {
-        let tensors = self.network.tensors().into_iter();
-        let mut weights: Vec<_> = tensors.map(|(name, tensor)| (format!("network.{name}"), tensor.to_vec())).collect();
+    pub fn in_weights(&self, network: &Network<T>, with_step_size: bool) -> Vec<(String, Vec<T>)> {
+        let weights = network.in_weights(&self.network).into_iter();
+        let mut weights: Vec<_> = weights.map(|(name, weight)| (format!("network.{name}"), weight)).collect();
         if with_step_size {
             weights.push(("step_size".to_owned(), vec![self.step_size]));
         }

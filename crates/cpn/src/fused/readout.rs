@@ -89,7 +89,7 @@ fn adjoint<T: Real, E: Factor<Sum = T>>(
     [in_x, in_y]: &mut [Aligned<E>; 2],
 ) {
     let factors = (E::across(x, linear.inputs, in_x), E::across(y_hat, linear.outputs, in_y));
-    linear.accumulate(linear.all(), factors, gradient);
-    gradient.add_bias(linear.all(), y_hat);
-    linear.backward(false, linear.all(), E::along(y_hat, in_y), x_hat);
+    linear.accumulate(factors, gradient);
+    gradient.add_bias(y_hat);
+    linear.backward(E::along(y_hat, in_y), x_hat);
 }

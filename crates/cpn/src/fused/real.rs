@@ -229,18 +229,19 @@ impl Real for f32 {
         let splat = |value: f32| simd.splat_f32s(value);
         // Beyond, float32 has neither room nor digits; the sigmoid is 0 or 1 long before. Not a number stays so.
         let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-88.0), lanes));
-        // Adding this rounds to a whole number, which then stands in the low bits.
-        const ROUND: f32 = 12_582_912.0;
+        // Adding this rounds to a whole number, which then stands in the low bits, as an exponent does: 127 above.
+        const ROUND: f32 = 12_582_912.0 + 127.0;
         let log2_e = splat(-std::f32::consts::LOG2_E);
         let shifted = simd.mul_add_f32s(x, log2_e, splat(ROUND));
         let rest = simd.mul_add_f32s(x, log2_e, simd.sub_f32s(splat(ROUND), shifted));
-        let mut power = splat(1.534_581_2e-4);
-        for coefficient in [1.339_993_1e-3, 9.618_489e-3, 5.550_328_8e-2, 2.402_264_7e-1, 6.931_472e-1, 1.0] {
+        // 2 to the rest, within 1.1e-7: a minimax polynomial.
+        let mut power = splat(1.330_06e-3);
+        for coefficient in [9.669_69e-3, 5.550_558e-2, 2.402_228_2e-1, std::f32::consts::LN_2, 1.0] {
             power = simd.mul_add_f32s(power, rest, splat(coefficient));
         }
-        let bias = simd.splat_u32s(127u32.wrapping_sub(ROUND.to_bits()));
-        let exponent = simd.add_u32s(simd.transmute_u32s_f32s(shifted), bias);
-        let scale = simd.transmute_f32s_u32s(simd.wrapping_dyn_shl_u32s(exponent, simd.splat_u32s(23)));
+        // The higher bits go over the edge.
+        let exponent = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(23));
+        let scale = simd.transmute_f32s_u32s(exponent);
         simd.div_f32s(splat(1.0), simd.mul_add_f32s(power, scale, splat(1.0)))
     }
 }

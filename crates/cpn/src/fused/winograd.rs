@@ -87,7 +87,7 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
                     if pair == ONES {
                         layer.forward(d, p);
                     } else {
-                        layer.tangent(layer.all(), d, p);
+                        layer.tangent(d, p);
                     }
                 }
             }
@@ -119,12 +119,12 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
                 self.tiles.leave_adjoint(point, y_hat, p, inner);
                 for (pair, layer, (d, p)) in self.layers(point, d, p) {
                     let factors = (E::across(d, layer.inputs, in_d), E::across(p, layer.outputs, in_p));
-                    layer.accumulate(layer.all(), factors, &mut gradient[pair]);
+                    layer.accumulate(factors, &mut gradient[pair]);
                     if pair == ONES {
-                        gradient[pair].add_bias(layer.all(), p);
+                        gradient[pair].add_bias(p);
                     }
                     if x_hat.is_some() {
-                        layer.backward(false, layer.all(), E::along(p, in_p), d);
+                        layer.backward(E::along(p, in_p), d);
                     }
                 }
                 if let Some(x_hat) = &mut x_hat {
