@@ -17,6 +17,8 @@ use tch::{Kind, Tensor};
 const TOLERANCE: f64 = 1e-5;
 /// What embeddings of about 1 are moved by to see how a plan moves with them: some of float32's last places.
 const ROUNDING: f64 = 1e-6;
+/// How many ways they are moved.
+const DIRECTIONS: u64 = 32;
 const SAMPLERS: [Solver; 3] = [Solver::Cem(40), Solver::Mppi(40), Solver::Hybrid(40)];
 
 fn floats(tensor: &Tensor) -> Vec<f64> {
@@ -87,12 +89,12 @@ fn sizes() -> impl Strategy<Value = ModelConfig> {
     )
 }
 
-/// The same plans again, `[8 B]`, from beginnings that are moved by about what float32 rounds along a computation: how far a
+/// The same plans again, `[2 DIRECTIONS B]`, from beginnings that are moved by about what float32 rounds along a computation: how far a
 /// plan moves is how far float32 may. A rollout can be steep, and the gradient jumps where a rectified linear unit opens. Each
 /// direction is taken both ways, so that one of them opens what rounding may open.
 fn moved(agent: &Agent, x: &Tensor, x_g: &Tensor) -> TensorPlan {
     let around = |tensor: &Tensor, seed: u64| {
-        let moves = (0..4).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);
+        let moves = (0..DIRECTIONS).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);
         Tensor::cat(&moves.flat_map(|by| [tensor + &by, tensor - by]).collect::<Vec<_>>(), 0)
     };
     agent.plan(&around(x, 0), &around(x_g, 1))
@@ -119,7 +121,7 @@ proptest! {
         for (row, plan) in plans.iter().enumerate() {
             let [actions, losses] = parts(&reference, row);
             let mut rounding = [0.0f64; 2];
-            for other in (row..8 * rows).step_by(rows) {
+            for other in (row..2 * DIRECTIONS as usize * rows).step_by(rows) {
                 let other = parts(&others, other);
                 rounding[0] = rounding[0].max(farthest(&other[0], &actions));
                 rounding[1] = rounding[1].max(farthest(&other[1], &losses));
