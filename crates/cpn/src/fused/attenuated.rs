@@ -12,6 +12,7 @@ use super::real::Real;
 use super::rectified::Open;
 use super::sparse::Part;
 use pulp::{Arch, Simd};
+use std::ops::Range;
 
 /// The weights and their gate.
 #[derive(Debug)]
@@ -35,11 +36,13 @@ pub struct AttenuatedGradient<T> {
     pub gate: GateGradient<T>,
 }
 
-/// What the passes leave for each other.
+/// What the passes leave for each other. A part of u stands where its blocks would in `[I, R, O']`, row by row; of ṡ likewise.
 #[derive(Debug)]
 pub struct AttenuatedTape<T> {
     /// Where x is not closed.
     open: Open,
+    u: Aligned<T>,
+    s_dot: Aligned<T>,
     pub gate: GateTape<T>,
 }
 
@@ -83,7 +86,8 @@ impl<T: Real> Attenuated<T> {
     }
 
     pub fn tape(&self, rows: usize) -> AttenuatedTape<T> {
-        AttenuatedTape { open: Open::new(), gate: self.gate.tape(rows) }
+        let size = rows * self.inputs * self.width();
+        AttenuatedTape { open: Open::new(), u: zeros(size), s_dot: zeros(size), gate: self.gate.tape(rows) }
     }
 
     /// O'.
@@ -99,12 +103,12 @@ impl<T: Real> Attenuated<T> {
 
     /// Adds to y what x gives; `seen` is what the gate sees.
     pub fn forward(&self, rows: usize, (seen, x): (&[T], &[T]), tape: &mut AttenuatedTape<T>, y: &mut [T]) {
-        let AttenuatedTape { open, gate } = tape;
+        let AttenuatedTape { open, u, gate, .. } = tape;
         open.find(x, self.inputs, self.rectified, self.gate.part());
         self.gate.enter(rows, seen, gate);
         for part in self.parts(rows, open) {
-            let u = self.gate.forward(&part, gate);
-            Arch::new().dispatch(Forward { layer: self, part: &part, x, u, y });
+            let u = &mut u[self.place(&part)];
+            self.gate.forward(&part, gate, &mut Forward { layer: self, part: &part, x, u, y });
         }
     }
 
@@ -117,10 +121,10 @@ impl<T: Real> Attenuated<T> {
         scratch: &mut Scratch<T>,
         x_bar: &mut [T],
     ) {
-        let AttenuatedTape { open, gate } = tape;
+        let AttenuatedTape { open, u, gate, .. } = tape;
         for part in self.parts(rows, open) {
             let s_bar = grown(&mut scratch.s, rows * part.blocks.len() * self.width());
-            let u = gate.out(&part);
+            let u = &u[self.place(&part)];
             Arch::new().dispatch(Backward { layer: self, part: &part, x, u, y_bar, x_bar, s_bar });
             self.gate.backward(&part, s_bar, &mut scratch.sums, gate);
         }
@@ -135,12 +139,12 @@ impl<T: Real> Attenuated<T> {
         tape: &mut AttenuatedTape<T>,
         y_dot: &mut [T],
     ) {
-        let AttenuatedTape { open, gate } = tape;
+        let AttenuatedTape { open, u, s_dot, gate } = tape;
         self.gate.enter_tangent(rows, seen_dot, gate);
         for part in self.parts(rows, open) {
-            self.gate.tangent(&part, gate);
-            let (u, s_dot) = (gate.out(&part), gate.s_dot(&part));
-            Arch::new().dispatch(Tangent { layer: self, part: &part, x, x_dot, u, s_dot, y_dot });
+            let place = self.place(&part);
+            let (u, s_dot) = (&u[place.clone()], &mut s_dot[place]);
+            self.gate.tangent(&part, gate, &mut Tangent { layer: self, part: &part, x, x_dot, u, s_dot, y_dot });
         }
     }
 
@@ -154,11 +158,12 @@ impl<T: Real> Attenuated<T> {
         scratch: &mut Scratch<T>,
         (x_hat, gradient): (&mut [T], &mut AttenuatedGradient<T>),
     ) {
-        let AttenuatedTape { open, gate } = tape;
+        let AttenuatedTape { open, u, s_dot, gate } = tape;
         for part in self.parts(rows, open) {
             let size = rows * part.blocks.len() * self.width();
             let (s_hat, s_bar) = grown(&mut scratch.s, 2 * size).split_at_mut(size);
-            let (u, s_dot, in_a) = (gate.out(&part), gate.s_dot(&part), &mut *gradient.a);
+            let place = self.place(&part);
+            let (u, s_dot, in_a) = (&u[place.clone()], &s_dot[place], &mut *gradient.a);
             let (layer, part, x_hat) = (self, &part, &mut *x_hat);
             let s_bar = match second {
                 None => {
@@ -173,6 +178,12 @@ impl<T: Real> Attenuated<T> {
             };
             self.gate.adjoint(part, (s_hat, s_bar), &mut scratch.sums, gate, &mut gradient.gate);
         }
+    }
+
+    /// Where what belongs to a part of u stands.
+    fn place(&self, part: &Part<'_>) -> Range<usize> {
+        let size = part.rows * self.width();
+        part.blocks.start * size..part.blocks.end * size
     }
 
     fn parts<'a>(&self, rows: usize, open: &'a Open) -> impl Iterator<Item = Part<'a>> + use<'a, T> {

@@ -5,8 +5,7 @@ use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::real::Real;
 use super::rectified::{Open, rectify};
-use super::sparse::{Part, Sparse, SparseGradient};
-use std::ops::Range;
+use super::sparse::{Part, Sparse, SparseGradient, Taker};
 
 /// Weights of a part: 32 KB in float32.
 const PART: usize = 1 << 13;
@@ -26,37 +25,17 @@ pub struct GateGradient<T> {
     output: SparseGradient<T>,
 }
 
-/// What the passes over a gate leave for each other. A part of s stands where its blocks would in `[blocks, R, O']`, row by row.
+/// What the passes over a gate leave for each other.
 #[derive(Debug)]
 pub struct GateTape<T> {
     /// K.
     hidden: usize,
-    /// O'.
-    width: usize,
     /// h and ḣ, `[2 R, K]`.
     h: Aligned<T>,
     /// Where h is not zero.
     open: Open,
     /// ĥ and h̄, `[2 R, K]`.
     h_adjoint: Aligned<T>,
-    /// First s, then σ(s).
-    out: Aligned<T>,
-    s_dot: Aligned<T>,
-}
-
-impl<T: Real> GateTape<T> {
-    pub fn out(&self, part: &Part<'_>) -> &[T] {
-        &self.out[self.place(part)]
-    }
-
-    pub fn s_dot(&self, part: &Part<'_>) -> &[T] {
-        &self.s_dot[self.place(part)]
-    }
-
-    fn place(&self, part: &Part<'_>) -> Range<usize> {
-        let size = part.rows * self.width;
-        part.blocks.start * size..part.blocks.end * size
-    }
 }
 
 impl<T: Real> Gate<T> {
@@ -79,17 +58,8 @@ impl<T: Real> Gate<T> {
     }
 
     pub fn tape(&self, rows: usize) -> GateTape<T> {
-        let (hidden, width) = (self.hidden.outputs, self.output.width);
-        let size = rows * self.output.blocks() * width;
-        GateTape {
-            hidden,
-            width,
-            h: zeros(2 * rows * hidden),
-            open: Open::new(),
-            h_adjoint: zeros(2 * rows * hidden),
-            out: zeros(size),
-            s_dot: zeros(size),
-        }
+        let hidden = self.hidden.outputs;
+        GateTape { hidden, h: zeros(2 * rows * hidden), open: Open::new(), h_adjoint: zeros(2 * rows * hidden) }
     }
 
     /// O'.
@@ -110,12 +80,9 @@ impl<T: Real> Gate<T> {
         tape.open.find(h, tape.hidden, tape.hidden, tape.hidden);
     }
 
-    /// Leaves s on the tape, for somebody to make σ(s) of it.
-    pub fn forward<'a>(&self, part: &Part<'_>, tape: &'a mut GateTape<T>) -> &'a mut [T] {
-        let place = tape.place(part);
-        let out = &mut tape.out[place];
-        self.output.forward(part, &tape.open, &tape.h, out);
-        out
+    /// Gives s of a part, as it comes.
+    pub fn forward(&self, part: &Part<'_>, tape: &GateTape<T>, taker: &mut impl Taker<T>) {
+        self.output.forward(part, &tape.open, &tape.h, taker);
     }
 
     /// Before any [`Self::tangent`]: leaves ḣ of ẋ `[R, inputs]` on the tape.
@@ -124,11 +91,9 @@ impl<T: Real> Gate<T> {
         self.hidden.tangent(x_dot, h_dot);
     }
 
-    /// Leaves ṡ on the tape.
-    pub fn tangent(&self, part: &Part<'_>, tape: &mut GateTape<T>) {
-        let place = tape.place(part);
-        let h_dot = &tape.h[part.rows * tape.hidden..];
-        self.output.tangent(part, &tape.open, h_dot, &mut tape.s_dot[place]);
+    /// Gives ṡ of a part, as it comes.
+    pub fn tangent(&self, part: &Part<'_>, tape: &GateTape<T>, taker: &mut impl Taker<T>) {
+        self.output.tangent(part, &tape.open, &tape.h[part.rows * tape.hidden..], taker);
     }
 
     /// Adds up h̄ from s̄ of a part, the first of which begins anew.

@@ -6,10 +6,10 @@
 use super::attenuated::Attenuated;
 use super::lanes::{Lanes, registers, registers_mut};
 use super::real::Real;
-use super::sparse::Part;
+use super::sparse::{Part, Taker};
 use pulp::{Simd, WithSimd};
 
-/// Adds to y; turns s into u on the way.
+/// Adds to y; leaves u of s, as that comes.
 #[derive(Debug)]
 pub struct Forward<'a, T> {
     pub layer: &'a Attenuated<T>,
@@ -19,30 +19,26 @@ pub struct Forward<'a, T> {
     pub y: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Forward<'_, T> {
-    type Output = ();
-
+impl<T: Real> Taker<T> for Forward<'_, T> {
     #[inline(always)]
-    fn with_simd<S: Simd>(mut self, simd: S) {
-        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
-        outputs(simd, &mut self, rows, registers);
-    }
-}
-
-impl<S: Simd, T: Real> Outputs<S> for Forward<'_, T> {
-    #[inline(always)]
-    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+    fn take<S: Simd, const P: usize, const W: usize>(
+        &mut self,
+        simd: S,
+        r: usize,
+        blocks: [usize; P],
+        tile: usize,
+        s: [[Lanes<S, T>; W]; P],
+    ) {
         let Self { layer, part, x, u, y } = self;
         let Attenuated { inputs, outputs, ref a, .. } = **layer;
-        let (x, y, width) = (&x[r * inputs..][..inputs], &mut y[r * outputs..][..outputs], layer.width());
+        let (x, y, width, at) = (&x[r * inputs..][..inputs], &mut y[r * outputs..][..outputs], layer.width(), tile * W);
         let mut sums = load::<S, T, W>(simd, y, at);
-        for i in part.wanted(r) {
+        for (i, s) in blocks.into_iter().zip(s) {
             let [a] = line::<S, T, W, 1>(simd, [&a[i * width..]], at);
             let [u] = line_mut::<S, T, W, 1>(simd, [&mut u[part.at(r, i, width)..]], at);
             let x = Lanes::splat(simd, x[i]);
-            for (w, sum) in sums.iter_mut().enumerate() {
-                let [s, a] = Lanes::each(simd, [u[w], a[w]]);
-                let open = s.sigmoid();
+            for (w, (sum, s)) in sums.iter_mut().zip(s).enumerate() {
+                let ([a], open) = (Lanes::each(simd, [a[w]]), s.sigmoid());
                 u[w] = open.values();
                 *sum = (open * a).mul_add(x, *sum);
             }
@@ -97,7 +93,7 @@ impl<S: Simd, T: Real> Outputs<S> for Backward<'_, T> {
     }
 }
 
-/// Adds to ẏ.
+/// Adds to ẏ; leaves ṡ, as that comes.
 #[derive(Debug)]
 pub struct Tangent<'a, T> {
     pub layer: &'a Attenuated<T>,
@@ -105,35 +101,34 @@ pub struct Tangent<'a, T> {
     pub x: &'a [T],
     pub x_dot: &'a [T],
     pub u: &'a [T],
-    pub s_dot: &'a [T],
+    pub s_dot: &'a mut [T],
     pub y_dot: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Tangent<'_, T> {
-    type Output = ();
-
+impl<T: Real> Taker<T> for Tangent<'_, T> {
     #[inline(always)]
-    fn with_simd<S: Simd>(mut self, simd: S) {
-        let (rows, registers) = (self.part.rows, self.layer.registers::<S>());
-        outputs(simd, &mut self, rows, registers);
-    }
-}
-
-impl<S: Simd, T: Real> Outputs<S> for Tangent<'_, T> {
-    #[inline(always)]
-    fn some<const W: usize>(&mut self, simd: S, r: usize, at: usize) {
+    fn take<S: Simd, const P: usize, const W: usize>(
+        &mut self,
+        simd: S,
+        r: usize,
+        blocks: [usize; P],
+        tile: usize,
+        s: [[Lanes<S, T>; W]; P],
+    ) {
         let Self { layer, part, x, x_dot, u, s_dot, y_dot } = self;
         let Attenuated { inputs, outputs, ref a, .. } = **layer;
-        let (y_dot, width, one) = (&mut y_dot[r * outputs..][..outputs], layer.width(), Lanes::splat(simd, T::ONE));
+        let (y_dot, width, at) = (&mut y_dot[r * outputs..][..outputs], layer.width(), tile * W);
         let [x, x_dot] = [*x, *x_dot].map(|x| &x[r * inputs..][..inputs]);
-        let mut sums = load::<S, T, W>(simd, y_dot, at);
-        for i in part.wanted(r) {
+        let (mut sums, one) = (load::<S, T, W>(simd, y_dot, at), Lanes::splat(simd, T::ONE));
+        for (i, s) in blocks.into_iter().zip(s) {
             let place = part.at(r, i, width);
-            let [u, s_dot, a] = line::<S, T, W, 3>(simd, [&u[place..], &s_dot[place..], &a[i * width..]], at);
+            let [u, a] = line::<S, T, W, 2>(simd, [&u[place..], &a[i * width..]], at);
+            let [s_dot] = line_mut::<S, T, W, 1>(simd, [&mut s_dot[place..]], at);
             let (x, x_dot) = (Lanes::splat(simd, x[i]), Lanes::splat(simd, x_dot[i]));
-            for (w, sum) in sums.iter_mut().enumerate() {
-                let [u, s_dot, a] = Lanes::each(simd, [u[w], s_dot[w], a[w]]);
-                *sum = (a * u).mul_add(((one - u) * s_dot).mul_add(x, x_dot), *sum);
+            for (w, (sum, s)) in sums.iter_mut().zip(s).enumerate() {
+                let [u, a] = Lanes::each(simd, [u[w], a[w]]);
+                s_dot[w] = s.values();
+                *sum = (a * u).mul_add(((one - u) * s).mul_add(x, x_dot), *sum);
             }
         }
         store(sums, y_dot, at);

@@ -100,14 +100,14 @@ impl<T: Real> Sparse<T> {
         SparseGradient { weight: zeros(self.weight.len()), bias: zeros(self.bias.len()) }
     }
 
-    /// y = a x + b of a part: x `[R, K]`, where it is open, to y `[R, its blocks, O']`.
-    pub fn forward(&self, part: &Part<'_>, open: &Open, x: &[T], y: &mut [T]) {
-        Arch::new().dispatch(Forward { layer: self, part, open, bias: &self.bias, x, y });
+    /// y = a x + b of a part: x `[R, K]`, where it is open; y is taken as it comes.
+    pub fn forward(&self, part: &Part<'_>, open: &Open, x: &[T], taker: &mut impl Taker<T>) {
+        Arch::new().dispatch(Forward { layer: self, part, open, bias: &self.bias, x, taker });
     }
 
     /// ẏ = a ẋ of a part, likewise.
-    pub fn tangent(&self, part: &Part<'_>, open: &Open, x_dot: &[T], y_dot: &mut [T]) {
-        Arch::new().dispatch(Forward { layer: self, part, open, bias: &self.zeros, x: x_dot, y: y_dot });
+    pub fn tangent(&self, part: &Part<'_>, open: &Open, x_dot: &[T], taker: &mut impl Taker<T>) {
+        Arch::new().dispatch(Forward { layer: self, part, open, bias: &self.zeros, x: x_dot, taker });
     }
 
     /// x̄ `[R, K]` of ȳ, which comes part by part, `[R, its blocks, O']`: the first begins anew, and after the last it is there.
@@ -225,18 +225,31 @@ fn tiles<S: Simd, const W: usize>(simd: S, pass: &mut impl Pass<S>, r: usize, wa
     }
 }
 
+/// Takes what a layer gives while it is still in registers.
+pub trait Taker<T: Real> {
+    /// Tiles of W registers of P blocks of row r.
+    fn take<S: Simd, const P: usize, const W: usize>(
+        &mut self,
+        simd: S,
+        r: usize,
+        blocks: [usize; P],
+        tile: usize,
+        values: [[Lanes<S, T>; W]; P],
+    );
+}
+
 #[derive(Debug)]
-struct Forward<'a, T> {
+struct Forward<'a, T, F> {
     layer: &'a Sparse<T>,
     part: &'a Part<'a>,
     open: &'a Open,
     /// `[blocks, O']`.
     bias: &'a [T],
     x: &'a [T],
-    y: &'a mut [T],
+    taker: &'a mut F,
 }
 
-impl<T: Real> WithSimd for Forward<'_, T> {
+impl<T: Real, F: Taker<T>> WithSimd for Forward<'_, T, F> {
     type Output = ();
 
     #[inline(always)]
@@ -246,10 +259,10 @@ impl<T: Real> WithSimd for Forward<'_, T> {
     }
 }
 
-impl<S: Simd, T: Real> Pass<S> for Forward<'_, T> {
+impl<S: Simd, T: Real, F: Taker<T>> Pass<S> for Forward<'_, T, F> {
     #[inline(always)]
     fn blocks<const P: usize, const W: usize>(&mut self, simd: S, r: usize, blocks: [usize; P], tile: usize) {
-        let Self { layer, part, open, bias, x, y } = self;
+        let Self { layer, open, bias, x, taker, .. } = self;
         let (inputs, registers_of_block) = (layer.inputs, layer.registers::<S>());
         let tiles = registers_of_block / W;
         let x = &x[r * inputs..][..inputs];
@@ -270,12 +283,7 @@ impl<S: Simd, T: Real> Pass<S> for Forward<'_, T> {
                 }
             }
         }
-        for (sums, block) in sums.iter().zip(blocks) {
-            let [y] = registers_mut(simd, [&mut y[part.at(r, block, layer.width)..]], registers_of_block);
-            for (y, sum) in y[tile * W..][..W].iter_mut().zip(sums) {
-                *y = sum.values();
-            }
-        }
+        taker.take(simd, r, blocks, tile, sums);
     }
 }
 
