@@ -5,7 +5,7 @@ use crate::goals::Goals;
 use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::unknown_model;
-use crate::task::PlanTask;
+use crate::task::{Answer, PlanTask, Reply};
 use anyhow::Context;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -69,6 +69,20 @@ impl PlannerCore {
     /// `RESOURCE_EXHAUSTED` if the queue is full, or so long that the deadline would pass; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
     /// that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
+        self.thread.plan(self.task(request)?).await
+    }
+
+    /// The same for who awaits nothing: `reply` is called with the answer, at once or on the model's thread, which it must not
+    /// hold up. Whoever calls keeps the deadline of a plan that is being made.
+    pub(crate) fn plan_then(&self, request: PlanRequest, reply: impl FnOnce(Answer) + Send + 'static) {
+        match self.task(request) {
+            Ok(task) => self.thread.enqueue(task, Reply::Called(Box::new(reply))),
+            Err(error) => reply(Err(error)),
+        }
+    }
+
+    /// What the model thread is to do.
+    fn task(&self, request: PlanRequest) -> Result<PlanTask, Error> {
         let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start } = request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
@@ -87,7 +101,7 @@ impl PlannerCore {
             }
             Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
-        let task = PlanTask {
+        Ok(PlanTask {
             model,
             model_digest,
             goal_id,
@@ -99,8 +113,7 @@ impl PlannerCore {
             search,
             warm_start,
             span: Span::current(),
-        };
-        self.thread.plan(task).await
+        })
     }
 
     /// Keeps a goal image; the same image gets the same id.

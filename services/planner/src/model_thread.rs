@@ -5,14 +5,15 @@ use crate::config::Config;
 use crate::load::Load;
 use crate::model::Model;
 use crate::owner::Owner;
-use crate::task::{PlanTask, Waiting, queue_full, too_late, too_many};
+use crate::task::{Answer, PlanTask, Reply, Waiting, queue_full, too_late, too_many};
 use std::collections::BTreeMap;
-use std::sync::{Arc, mpsc};
+use std::sync::Arc;
+use std::sync::mpsc::{self, SendError};
 use std::time::Instant;
 use std::{io, thread};
-use tokio::sync::{Semaphore, oneshot, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use tracing::debug_span;
-use wire::planner::{ModelInfo, PlanResponse};
+use wire::planner::ModelInfo;
 use wire::{Code, Error};
 
 /// The caller's side of the thread.
@@ -60,25 +61,43 @@ impl ModelThread {
     /// # Errors
     /// If the queue is full, or so long that the deadline would pass; if it does pass, the thread has stopped, or planning
     /// fails.
-    pub(crate) async fn plan(&self, task: PlanTask) -> Result<PlanResponse, Error> {
-        let enqueued = Instant::now();
-        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| queue_full(self.capacity))?;
-        let deadline = task.deadline;
-        let wait = self.load.time(self.load.tasks() + 1);
-        if let Some(deadline) = deadline.filter(|deadline| wait > *deadline && self.load.tasks() > 0) {
-            return Err(too_many(deadline, wait));
-        }
+    pub(crate) async fn plan(&self, task: PlanTask) -> Answer {
+        let due = task.deadline.map(|deadline| (Instant::now() + deadline, deadline));
         let (reply, answer) = oneshot::channel();
-        self.load.begin();
-        let queued = debug_span!(parent: &task.span, "queue");
-        self.jobs.send(Job::Plan(Waiting { task, enqueued, queued, place, reply })).map_err(|_| stopped())?;
-        let answer = match deadline {
-            Some(deadline) => {
-                tokio::time::timeout_at((enqueued + deadline).into(), answer).await.map_err(|_| too_late(deadline))?
+        self.enqueue(task, Reply::Awaited(reply));
+        let answer = match due {
+            Some((due, deadline)) => {
+                tokio::time::timeout_at(due.into(), answer).await.map_err(|_| too_late(deadline))?
             }
             None => answer.await,
         };
         answer.map_err(|_| stopped())?
+    }
+
+    /// Puts a task in the queue, or replies at once: if the queue is full, or so long that the deadline would pass, or the
+    /// thread has stopped.
+    pub(crate) fn enqueue(&self, task: PlanTask, reply: Reply) {
+        let enqueued = Instant::now();
+        let place = match self.admit(&task) {
+            Ok(place) => place,
+            Err(error) => return reply.send(Err(error)),
+        };
+        self.load.begin();
+        let queued = debug_span!(parent: &task.span, "queue");
+        let job = Job::Plan(Waiting { task, enqueued, queued, place, reply });
+        if let Err(SendError(Job::Plan(Waiting { reply, .. }))) = self.jobs.send(job) {
+            reply.send(Err(stopped()));
+        }
+    }
+
+    /// A place in the queue, if the answer can come in time.
+    fn admit(&self, task: &PlanTask) -> Result<OwnedSemaphorePermit, Error> {
+        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| queue_full(self.capacity))?;
+        let wait = self.load.time(self.load.tasks() + 1);
+        if let Some(deadline) = task.deadline.filter(|deadline| wait > *deadline && self.load.tasks() > 0) {
+            return Err(too_many(deadline, wait));
+        }
+        Ok(place)
     }
 
     /// Serves a model, in place of the one of its name, from the next plan on.

@@ -5,7 +5,7 @@ use crate::load::Load;
 use crate::model::{Model, Planned};
 use crate::model_thread::Job;
 use crate::served::Served;
-use crate::task::{PlanTask, Waiting, too_late};
+use crate::task::{Answer, PlanTask, Reply, Waiting, too_late};
 use cpn::method::Query;
 use lru::LruCache;
 use metrics::{counter, histogram};
@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
-use tokio::sync::{oneshot, watch};
+use tokio::sync::watch;
 use tracing::{debug_span, error};
 use wire::planner::{ModelInfo, PlanResponse, StageTimes};
 use wire::{Code, Error};
@@ -124,7 +124,7 @@ impl Owner {
             // A client that gave up has closed its end.
             let late = task.deadline.filter(|deadline| started - enqueued >= *deadline);
             match late.map_or_else(|| self.check(&task), |deadline| Err(too_late(deadline))) {
-                _ if reply.is_closed() => self.load.end(),
+                _ if reply.is_given_up() => self.load.end(),
                 Ok(()) => accepted.push((task, enqueued, reply)),
                 Err(error) => self.reply(reply, Err(error)),
             }
@@ -151,9 +151,9 @@ impl Owner {
         }
     }
 
-    fn reply(&self, reply: oneshot::Sender<Result<PlanResponse, Error>>, answer: Result<PlanResponse, Error>) {
+    fn reply(&self, reply: Reply, answer: Answer) {
         self.load.end();
-        let _ = reply.send(answer);
+        reply.send(answer);
     }
 
     fn check(&mut self, task: &PlanTask) -> Result<(), Error> {
@@ -161,7 +161,7 @@ impl Owner {
     }
 
     /// Plans, one for each task; a panic is everybody's error.
-    fn guarded(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Result<PlanResponse, Error>> {
+    fn guarded(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Answer> {
         catch_unwind(AssertUnwindSafe(|| self.plan(tasks, clock))).unwrap_or_else(|panic| {
             let reason = panic_message(&*panic);
             error!(model = tasks[0].model, reason, "planning panicked");
@@ -170,7 +170,7 @@ impl Owner {
     }
 
     /// Plans for tasks of one kind that were checked.
-    fn plan(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Result<PlanResponse, Error>> {
+    fn plan(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Answer> {
         let Self { models, embeddings, load, .. } = self;
         let PlanTask { model, model_digest, search, .. } = tasks[0];
         let model = models.get(model, model_digest.as_deref()).expect("checked");

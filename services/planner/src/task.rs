@@ -1,5 +1,6 @@
 //! A request to plan on its way to the model.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
@@ -36,7 +37,18 @@ pub(crate) struct Waiting {
     pub(crate) queued: Span,
     /// Given back when the plan starts.
     pub(crate) place: OwnedSemaphorePermit,
-    pub(crate) reply: oneshot::Sender<Result<PlanResponse, Error>>,
+    pub(crate) reply: Reply,
+}
+
+/// What a task comes to.
+pub(crate) type Answer = Result<PlanResponse, Error>;
+
+/// Where the answer goes.
+pub(crate) enum Reply {
+    /// To who awaits it, or has given up.
+    Awaited(oneshot::Sender<Answer>),
+    /// To what is called with it, on the model's thread, and must not hold that up.
+    Called(Box<dyn FnOnce(Answer) + Send>),
 }
 
 impl PlanTask {
@@ -74,6 +86,27 @@ impl PlanTask {
             }
         }
         Ok(())
+    }
+}
+
+impl Reply {
+    /// Whether nobody waits for the answer any more.
+    pub(crate) fn is_given_up(&self) -> bool {
+        matches!(self, Self::Awaited(sender) if sender.is_closed())
+    }
+
+    /// Hands the answer over.
+    pub(crate) fn send(self, answer: Answer) {
+        match self {
+            Self::Awaited(sender) => drop(sender.send(answer)),
+            Self::Called(call) => call(answer),
+        }
+    }
+}
+
+impl fmt::Debug for Reply {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.is_given_up() { "Reply(given up)" } else { "Reply" })
     }
 }
 

@@ -3,15 +3,15 @@
 use crate::config::Config;
 use crate::core::PlannerCore;
 use crate::follow::Follower;
-use crate::task::queue_full;
+use crate::task::{Answer, queue_full, too_late};
 use anyhow::{anyhow, ensure};
 use std::future::{Future, ready};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::{AbortOnDropHandle, TaskTracker};
-use tracing::{Instrument, debug_span, warn};
-use wire::planner::ListModelsRequest;
+use tracing::{Instrument, Span, debug_span, warn};
+use wire::planner::{ListModelsRequest, PlanRequest};
 use wire::{Error, Message, key, query, trace};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
@@ -52,7 +52,7 @@ impl ZenohServer {
             runtime: Handle::current(),
         };
         let queryables = vec![
-            requests.serve(plan, |core, request| async move { core.plan(request).await }).await?,
+            requests.serve_plans(plan).await?,
             requests
                 .serve(key::planner_register_goal(&config.name)?, |core, request| ready(core.register_goal(request)))
                 .await?,
@@ -124,7 +124,41 @@ struct Requests {
 }
 
 impl Requests {
-    /// Declares a queryable. Zenoh's callback only starts a task: it must not block the network thread.
+    /// Declares the queryable of plans. Zenoh's callback puts a request into the model's queue and the model's thread sends the
+    /// answer: each thread that is woken in between would take as long as a tenth of the plan.
+    async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
+        let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
+        let callback = move |query: Query| {
+            let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
+            let deadline = request.as_ref().ok().and_then(|request| request.deadline);
+            // The model's thread and the clock both want to answer; the first does.
+            let waiting = Arc::new(Mutex::new(Some((query, tasks.token()))));
+            let answer = move |plan: Answer| {
+                let waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner).take();
+                if let Some((query, _in_flight)) = waiting {
+                    reply(&query, plan);
+                }
+            };
+            let clock = deadline.map(|deadline| {
+                let answer = answer.clone();
+                AbortOnDropHandle::new(runtime.spawn(async move {
+                    tokio::time::sleep(deadline).await;
+                    answer(Err(too_late(deadline)));
+                }))
+            });
+            let planned = move |plan| {
+                answer(plan);
+                drop(clock);
+            };
+            match request {
+                Ok(request) => span.in_scope(|| core.plan_then(request, planned)),
+                Err(error) => planned(Err(error)),
+            }
+        };
+        self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
+    }
+
+    /// Declares another queryable. Zenoh's callback only starts a task: it must not block the network thread.
     async fn serve<Q, R, F, S>(&self, key: OwnedKeyExpr, serve: S) -> anyhow::Result<Queryable<()>>
     where
         Q: Message + Send,
@@ -137,20 +171,30 @@ impl Requests {
         let (tasks, runtime) = (tasks.clone(), runtime.clone());
         let callback = move |query: Query| {
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
-            let span = debug_span!("request", otel.kind = "server", key = %query.key_expr());
-            trace::follow(&span, query::traceparent(&query).as_deref());
+            let span = request_span(&query);
             let answer = async move {
                 let result = match (&place, query::request(&query)) {
                     (Err(_), _) => Err(queue_full(capacity)),
                     (Ok(_), Err(error)) => Err(error),
                     (Ok(_), Ok(request)) => serve(core, request).await,
                 };
-                if let Err(error) = query::reply(&query, result) {
-                    warn!(%error, key = %query.key_expr(), "answer not sent");
-                }
+                reply(&query, result);
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
+    }
+}
+
+/// The span of a request, below its sender's.
+fn request_span(query: &Query) -> Span {
+    let span = debug_span!("request", otel.kind = "server", key = %query.key_expr());
+    trace::follow(&span, query::traceparent(query).as_deref());
+    span
+}
+
+fn reply<R: Message>(query: &Query, answer: Result<R, Error>) {
+    if let Err(error) = query::reply(query, answer) {
+        warn!(%error, key = %query.key_expr(), "answer not sent");
     }
 }

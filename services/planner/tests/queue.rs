@@ -103,12 +103,14 @@ async fn a_plan_that_takes_too_long_is_given_up() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     let gate = Gate::serve(&core).await;
-    let slow = enqueue(&core, proto::PlanRequest { deadline_ms: 300, ..plan_request("gated", 1) }).await;
-    assert_eq!(gate.entered().await, 1);
-    is(Code::DeadlineExceeded, "deadline_ms", soon(slow).await);
-    gate.open();
-    let [client, ..] = fixture.clients();
-    client.plan(plan_request(RANDOM, 2)).await.unwrap();
+    for (client, seed) in fixture.clients().into_iter().zip(1..) {
+        let request = proto::PlanRequest { deadline_ms: 300, ..plan_request("gated", seed) };
+        let slow = async { is(Code::DeadlineExceeded, "deadline_ms", soon(client.plan(request)).await) };
+        let (entered, ()) = tokio::join!(gate.entered(), slow);
+        assert_eq!(entered, seed, "{}", client.transport());
+        gate.open();
+        client.plan(plan_request(RANDOM, 2)).await.unwrap();
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
