@@ -17,8 +17,8 @@
 //! | x_t, x_g | `x`, `x_g` | their embeddings, `[B, Z]` |
 //! | â_{t:t+H} | `Plan::actions` | planned actions, `[B, H, A]` |
 //!
-//! Tensors are validated once, where bytes become tensors ([`images`], [`positions`], [`checkpoint`]); past that edge a wrong shape is a
-//! bug and `tch` panics.
+//! Tensors are validated once, where bytes become tensors ([`images`], [`positions`], [`checkpoint`]); past that edge a wrong
+//! shape is a bug and `tch` panics.
 
 pub mod agent;
 pub mod archive;

@@ -89,9 +89,9 @@ fn sizes() -> impl Strategy<Value = ModelConfig> {
     )
 }
 
-/// The same plans again, `[2 DIRECTIONS B]`, from beginnings that are moved by about what float32 rounds along a computation: how far a
-/// plan moves is how far float32 may. A rollout can be steep, and the gradient jumps where a rectified linear unit opens. Each
-/// direction is taken both ways, so that one of them opens what rounding may open.
+/// The same plans again, `[2 DIRECTIONS B]`, from beginnings that are moved by about what float32 rounds along a computation:
+/// how far a plan moves is how far float32 may. A rollout can be steep, and the gradient jumps where a rectified linear unit
+/// opens. Each direction is taken both ways, so that one of them opens what rounding may open.
 fn moved(agent: &Agent, x: &Tensor, x_g: &Tensor) -> TensorPlan {
     let around = |tensor: &Tensor, seed: u64| {
         let moves = (0..DIRECTIONS).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);

@@ -115,7 +115,7 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<NonZeroU16>,
-    /// What images are embedded in, float32 or, where the processor has instructions for it (AVX512-BF16), bfloat16 [default: float32].
+    /// What images are embedded in: float32 or, where the processor has AVX512-BF16, bfloat16 [default: float32].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub precision: Option<String>,

@@ -66,8 +66,8 @@ impl PlannerCore {
     /// for an unknown model or goal id;
     /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently, or the checkpoint
     /// that must answer is not kept;
-    /// `RESOURCE_EXHAUSTED` if the queue is full, or so long that the deadline would pass; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan
-    /// that is not finite; `UNAVAILABLE` during shutdown.
+    /// `RESOURCE_EXHAUSTED` if the queue is full, or so long that the deadline would pass; `DEADLINE_EXCEEDED` once the
+    /// deadline has passed; `INTERNAL` for a plan that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
         self.thread.plan(self.task(request)?).await
     }

@@ -49,8 +49,8 @@ impl<T: Real> Embedder<T> {
 }
 
 impl<T: Real> Embedded<'_, T> {
-    /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name in a checkpoint. The order of its sums
-    /// depends on nothing but the frames and the number of threads.
+    /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name in a checkpoint. The order of its
+    /// sums depends on nothing but the frames and the number of threads.
     pub fn adjoint(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {
         let Self { encoder, frames, share, tapes } = self;
         let x_hats = x_hat.par_chunks(share * encoder.latent());

@@ -68,8 +68,8 @@ impl<T: Real, E: Factor<Sum = T>> Linear<E, T> {
         multiply(true, x_bar, Left::Rows(y_bar), Matrix::new(&self.weight, self.inputs));
     }
 
-    /// Adds ∂Φ/∂a to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold, across their rows, those of x and ŷ and, in the second order,
-    /// those of ẋ and ȳ after them.
+    /// Adds ∂Φ/∂a to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold, across their rows, those of x and ŷ and, in the second
+    /// order, those of ẋ and ȳ after them.
     pub fn accumulate(&self, (x, y): (&[E], &[E]), gradient: &mut LinearGradient<T>) {
         multiply(true, &mut gradient.weight, Left::Turned(y), Matrix::new(x, self.inputs));
     }

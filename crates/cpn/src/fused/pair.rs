@@ -100,8 +100,8 @@ fn natively<W: WithSimd>(simd: V4, kernel: W) -> W::Output {
     kernel.with_simd(simd)
 }
 
-/// The nearest bfloat16 in the upper half, from between two the larger, and anything in the lower. What an operation leaves as not
-/// a number stays so.
+/// The nearest bfloat16 in the upper half, from between two the larger, and anything in the lower. What an operation leaves as
+/// not a number stays so.
 #[inline(always)]
 fn rounded(number: f32) -> u32 {
     number.to_bits().wrapping_add(0x8000)

@@ -110,8 +110,8 @@ impl<T: Real> Sparse<T> {
         Arch::new().dispatch(Forward { layer: self, part, open, bias: &self.zeros, x: x_dot, taker });
     }
 
-    /// x̄ `[R, K]` of ȳ, which comes part by part, `[R, its blocks, O']`: the first begins anew, and after the last it is there.
-    /// Until then `sums` has a register for each x̄ that is open, whose lanes are added up once for all parts.
+    /// x̄ `[R, K]` of ȳ, which comes part by part, `[R, its blocks, O']`: the first begins anew, and after the last it is
+    /// there. Until then `sums` has a register for each x̄ that is open, whose lanes are added up once for all parts.
     pub fn backward(&self, part: &Part<'_>, open: &Open, y_bar: &[T], sums: &mut Aligned<T>, x_bar: &mut [T]) {
         let sums = grown(sums, part.rows * self.inputs * Shape::of::<T>().lanes);
         Arch::new().dispatch(Backward { layer: self, part, open, y_bar, sums });
