@@ -125,7 +125,7 @@ struct Requests {
 
 impl Requests {
     /// Declares the queryable of plans. Zenoh's callback puts a request into the model's queue and the model's thread sends the
-    /// answer: each thread that is woken in between would take as long as a tenth of the plan.
+    /// answer: a client that is alone would wait for every thread that had to be woken in between.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
         let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
         let callback = move |query: Query| {
