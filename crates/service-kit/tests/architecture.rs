@@ -29,6 +29,8 @@ fn each_crate_knows_only_what_it_may() {
         ("wire", &[]),
         ("service-kit", &[]),
         ("recording", &["wire"]),
+        ("signing", &[]),
+        ("certs", &[]),
         ("planner", &["cpn", "wire", "service-kit"]),
         ("trainer", &["cpn", "recording", "wire", "service-kit"]),
         ("evaluator", &["recording", "wire", "service-kit"]),
