@@ -1,0 +1,67 @@
+//! Reasons why a checkpoint is not what a trusted key signed.
+
+use std::fmt;
+
+/// Longest text of a bundle in an error, in bytes.
+const MAX_TEXT_BYTES: usize = 200;
+
+/// A checkpoint without a good signature.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("signature: expected {expected}, got {got}")]
+pub struct Error {
+    /// Kind of fault.
+    pub fault: Fault,
+    /// What would have been right.
+    pub expected: String,
+    /// What came.
+    pub got: String,
+}
+
+/// Kinds of faults of a signature.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// There is no bundle.
+    Unsigned,
+    /// The bundle is not one of this format.
+    Malformed,
+    /// No trusted key made the signature.
+    Untrusted,
+    /// A trusted key signed something else.
+    Mismatch,
+}
+
+impl Fault {
+    /// Name in logs and metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unsigned => "unsigned",
+            Self::Malformed => "malformed",
+            Self::Untrusted => "untrusted",
+            Self::Mismatch => "mismatch",
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Error {
+    /// An error; a text that is too long is cut.
+    pub(crate) fn new(fault: Fault, expected: impl ToString, got: impl ToString) -> Self {
+        let cut = |mut text: String| {
+            if text.len() > MAX_TEXT_BYTES {
+                text.truncate(text.floor_char_boundary(MAX_TEXT_BYTES));
+                text.push('…');
+            }
+            text
+        };
+        Self { fault, expected: cut(expected.to_string()), got: cut(got.to_string()) }
+    }
+
+    pub(crate) fn malformed(expected: impl ToString, got: impl ToString) -> Self {
+        Self::new(Fault::Malformed, expected, got)
+    }
+}
