@@ -1,12 +1,15 @@
 """The command line."""
 
 import logging
+import sys
 from typing import Annotated
 
 import tyro
+import zenoh
 
 from cpn_sim_worker.demonstrate import DemonstrateConfig, demonstrate
 from cpn_sim_worker.server import ServeConfig, serve
+from cpn_sim_worker.session import ConfigError
 
 Serve = Annotated[ServeConfig, tyro.conf.subcommand("serve")]
 Demonstrate = Annotated[DemonstrateConfig, tyro.conf.subcommand("demonstrate")]
@@ -15,8 +18,13 @@ Demonstrate = Annotated[DemonstrateConfig, tyro.conf.subcommand("demonstrate")]
 def main() -> None:
     """Runs the subcommand that the arguments name."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    match tyro.cli(Serve | Demonstrate, prog="cpn-sim-worker", config=(tyro.conf.OmitArgPrefixes,)):
-        case ServeConfig() as config:
-            serve(config)
-        case DemonstrateConfig() as config:
-            demonstrate(config)
+    # Zenoh's own log, where RUST_LOG asks for it.
+    zenoh.try_init_log_from_env()
+    try:
+        match tyro.cli(Serve | Demonstrate, prog="cpn-sim-worker", config=(tyro.conf.OmitArgPrefixes,)):
+            case ServeConfig() as config:
+                serve(config)
+            case DemonstrateConfig() as config:
+                demonstrate(config)
+    except ConfigError as error:
+        sys.exit(str(error))

@@ -1,9 +1,12 @@
 """Serves one simulator over zenoh."""
 
 import logging
+import os
 import queue
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -16,7 +19,7 @@ from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.episode import EpisodeRunner
 from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.session import ZenohConfig, open_session
+from cpn_sim_worker.session import REMINDER_SECONDS, StoppedError, ZenohConfig, is_connected, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.wire import RequestError, decode, encoding
 
@@ -29,6 +32,13 @@ QUEUE_LENGTH = 8
 
 POLL_SECONDS = 0.1
 """How long a signal to stop may go unnoticed while no request comes."""
+
+LEASE_SECONDS = 15.0
+"""Time that the token of a worker that has died may linger: zenoh's lease, 10 s, and some more."""
+ANSWER_SECONDS = 2.0
+"""Time that the network has to name the holders of a token."""
+MEETING_SECONDS = 1.0
+"""Time that a peer has to meet others before it looks who is there."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,48 @@ class ServeConfig:
         # Meta-World's environments refuse to go on after that many; Jenga would.
         if not 1 <= self.max_steps <= SawyerXYZEnv.max_path_length:
             raise ValueError(f"max_steps: expected 1 to {SawyerXYZEnv.max_path_length}, got {self.max_steps}")
+
+
+class NameTakenError(Exception):
+    """A worker's name that another worker has."""
+
+
+def claim_name(
+    session: zenoh.Session,
+    config: ServeConfig,
+    stop: threading.Event,
+    patience_seconds: float = LEASE_SECONDS,
+) -> None:
+    """Waits until no other worker has the name: two would each get a part of the requests.
+
+    Raises:
+        NameTakenError: If another worker still has it after `patience_seconds`.
+        StoppedError: If `stop` was set meanwhile.
+    """
+    start = time.monotonic()
+    while config.zenoh.connect and not is_connected(session) and time.monotonic() - start < MEETING_SECONDS:
+        stop.wait(POLL_SECONDS)
+
+    key = keys.sim_alive(config.worker)
+    start = time.monotonic()
+    reminded = None
+    while not stop.is_set():
+        replies = list(session.liveliness().get(key, timeout=ANSWER_SECONDS))
+        if not replies:
+            return
+        # A network that is too slow to answer does not say that the name is free.
+        taken = any(reply.ok is not None for reply in replies)
+        now = time.monotonic()
+        if taken and now - start >= patience_seconds:
+            raise NameTakenError(
+                f"worker: expected a name that no running worker has, got {config.worker!r}: "
+                "stop the other worker, or give this one another --worker"
+            )
+        if reminded is None or now - reminded >= REMINDER_SECONDS:
+            reminded = now
+            log.warning("worker %s runs elsewhere or has just died; waiting for it to go", config.worker)
+        stop.wait(POLL_SECONDS)
+    raise StoppedError("stopped before the worker's name was free")
 
 
 class SimServer:
@@ -152,5 +204,13 @@ def serve(config: ServeConfig) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     episodes = EpisodeRunner(Simulator(Renderer()), config.max_steps)
-    with open_session(config.zenoh) as session:
-        SimServer(session, config.worker, episodes).run(stop)
+    try:
+        with open_session(config.zenoh, stop) as session:
+            claim_name(session, config, stop)
+            SimServer(session, config.worker, episodes).run(stop)
+    except StoppedError as error:
+        log.info("%s", error)
+        # Not by way of the interpreter's end, which a thread still inside `zenoh.open` may abort.
+        os._exit(0)
+    except NameTakenError as error:
+        sys.exit(str(error))

@@ -1,12 +1,16 @@
 """Conversions between NumPy and the messages of `cpn.v1`, and the error that a message at fault raises."""
 
-from typing import TypeVar
+from __future__ import annotations
 
-import numpy as np
+from typing import TYPE_CHECKING, TypeVar
+
 from google.protobuf.message import DecodeError, Message
-from numpy.typing import NDArray
 
 from cpn.v1 import types_pb2
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 MAX_PAYLOAD_BYTES = 1 << 20
 """Far above every message of the project but a whole checkpoint, which no worker receives."""
@@ -30,7 +34,7 @@ class RequestError(Exception):
         return types_pb2.Error(code=self.code, field=self.field, expected=self.expected, got=self.got)
 
     @classmethod
-    def from_proto(cls, error: types_pb2.Error) -> "RequestError":
+    def from_proto(cls, error: types_pb2.Error) -> RequestError:
         """The error that a service answered with."""
         return cls(error.code, error.field, error.expected, error.got)
 
@@ -80,6 +84,8 @@ def action_to_proto(action: NDArray[np.float32]) -> types_pb2.Action:
 
 def action_from_proto(action: types_pb2.Action, size: int, field: str) -> NDArray[np.float32]:
     """An action, [size] in [-1, 1], from its message; `field` names it in a `RequestError`."""
+    import numpy as np  # Half of what a health check costs, which needs no arrays.
+
     if len(action.values) != size:
         raise invalid(f"{field}.values", f"{size} values", len(action.values))
     values = np.array(action.values, np.float32)
