@@ -1,6 +1,6 @@
+import logging
 import os
 import signal
-import socket
 import subprocess
 from collections.abc import Iterator
 
@@ -11,7 +11,16 @@ from cpn_sim_worker import keys
 from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.session import ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
-from tests.support import COMMAND, READY_SECONDS, StartWorker, collect, wait_for_sample
+from tests.support import COMMAND, READY_SECONDS, Log, StartWorker, collect, free_endpoint, wait_for_sample
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_options_from_outside() -> Iterator[None]:
+    """Takes away the variables that stand in for options, for the processes under test too."""
+    with pytest.MonkeyPatch.context() as patch:
+        for variable in [name for name in os.environ if name.startswith("CPN_") or name == "ZENOH_CONFIG"]:
+            patch.delenv(variable)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -22,9 +31,7 @@ def simulator() -> Simulator:
 
 @pytest.fixture(scope="session")
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture(scope="session")
@@ -53,3 +60,16 @@ def start_worker(session: zenoh.Session, endpoint: str) -> Iterator[StartWorker]
             os.kill(process.pid, signal.SIGTERM)
     for process in workers:
         assert process.wait(timeout=READY_SECONDS) == 0
+
+
+@pytest.fixture
+def session_log() -> Iterator[Log]:
+    """What the sessions of the test log."""
+    handler = Log()
+    logger = logging.getLogger("cpn_sim_worker.session")
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    yield handler
+    logger.removeHandler(handler)
+    logger.setLevel(level)

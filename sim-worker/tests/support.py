@@ -1,6 +1,10 @@
+import logging
 import queue
+import random
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +15,7 @@ from numpy.typing import NDArray
 from cpn.v1 import types_pb2
 
 COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker"))
+HEALTH_COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker-health"))
 READY_SECONDS = 60.0
 
 StartWorker = Callable[..., subprocess.Popen[bytes]]
@@ -36,3 +41,40 @@ def pixels(image: types_pb2.Image) -> NDArray[np.uint8]:
     """An image's pixels, [height, width, 3]."""
     assert image.format == types_pb2.PIXEL_FORMAT_RGB8
     return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+
+
+def free_endpoint(protocol: str = "tcp", host: str = "127.0.0.1") -> str:
+    """An endpoint that nobody listens on, below the ports that the system hands out.
+
+    Of those, one that a client asks again and again might be handed to the client itself.
+    """
+    while True:
+        port = random.randrange(20_000, 32_000)  # noqa: S311
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return f"{protocol}/{host}:{port}"
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Waits until the condition holds."""
+    end = time.monotonic() + READY_SECONDS
+    while not condition():
+        assert time.monotonic() < end, "the condition does not come true"
+        time.sleep(0.02)
+
+
+class Log(logging.Handler):
+    """What a logger says, seen from every thread."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+    def says(self, text: str) -> bool:
+        return any(text in line for line in self.lines)

@@ -78,15 +78,16 @@ def claim_name(
     start = time.monotonic()
     while config.zenoh.connect and not is_connected(session) and time.monotonic() - start < MEETING_SECONDS:
         stop.wait(POLL_SECONDS)
+    met = is_connected(session)
 
     key = keys.sim_alive(config.worker)
     start = time.monotonic()
     reminded = None
     while not stop.is_set():
         replies = list(session.liveliness().get(key, timeout=ANSWER_SECONDS))
-        if not replies:
+        # The name is not free for the reason that the network answers too late, or was lost.
+        if not replies and (is_connected(session) or not met):
             return
-        # A network that is too slow to answer does not say that the name is free.
         taken = any(reply.ok is not None for reply in replies)
         now = time.monotonic()
         if taken and now - start >= patience_seconds:
@@ -94,7 +95,7 @@ def claim_name(
                 f"worker: expected a name that no running worker has, got {config.worker!r}: "
                 "stop the other worker, or give this one another --worker"
             )
-        if reminded is None or now - reminded >= REMINDER_SECONDS:
+        if taken and (reminded is None or now - reminded >= REMINDER_SECONDS):
             reminded = now
             log.warning("worker %s runs elsewhere or has just died; waiting for it to go", config.worker)
         stop.wait(POLL_SECONDS)

@@ -1,0 +1,160 @@
+"""Mutual TLS between sessions, with certificates of an authority made for the test."""
+
+import json
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import trustme
+import zenoh
+
+from cpn.v1 import demonstration_pb2
+from cpn_sim_worker import keys
+from cpn_sim_worker.session import (
+    ConfigError,
+    Mode,
+    NoRouterError,
+    ZenohConfig,
+    ask,
+    is_connected,
+    look_in,
+    open_session,
+    zenoh_config,
+)
+from tests.support import READY_SECONDS, Log, free_endpoint, wait_for
+
+PATIENCE_SECONDS = 3.0
+"""Time for the first try of a client that is refused."""
+
+
+class Authority:
+    """A certificate authority, and a folder for what it issues."""
+
+    def __init__(self, folder: Path) -> None:
+        self._authority = trustme.CA(organization_name=folder.name)
+        self._folder = folder
+        folder.mkdir()
+        self.certificate = folder / "ca.pem"
+        self._authority.cert_pem.write_to_path(self.certificate)
+
+    def issue(self, name: str, host: str = "localhost", *, expired: bool = False) -> tuple[Path, Path]:
+        """A certificate and its key."""
+        end = datetime.now(UTC) + timedelta(days=-1 if expired else 1)
+        issued = self._authority.issue_cert(host, common_name=name, not_before=end - timedelta(days=2), not_after=end)
+        certificate, private_key = self._folder / f"{name}.pem", self._folder / f"{name}.key"
+        for number, blob in enumerate(issued.cert_chain_pems):
+            blob.write_to_path(certificate, append=number > 0)
+        issued.private_key_pem.write_to_path(private_key)
+        return certificate, private_key
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path / "ours")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint("tls", "localhost")
+
+
+def member(mode: Mode, endpoint: str, authority: Authority, files: tuple[Path, Path]) -> ZenohConfig:
+    return ZenohConfig(
+        mode=mode,
+        connect=(endpoint,) if mode == "client" else (),
+        listen=(endpoint,) if mode == "router" else (),
+        tls_ca=authority.certificate,
+        tls_certificate=files[0],
+        tls_private_key=files[1],
+    )
+
+
+def refusal_of(options: ZenohConfig) -> str:
+    with pytest.raises(NoRouterError) as refusal, look_in(options, PATIENCE_SECONDS):
+        pass
+    return str(refusal.value)
+
+
+def test_members_talk_over_mutual_tls(authority: Authority, endpoint: str) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            response = demonstration_pb2.CommitEpisodeResponse(missing_steps=[7])
+            query.reply(keys.demonstration_commit("e"), response.SerializeToString())
+
+    with (
+        open_session(member("router", endpoint, authority, authority.issue("router"))),
+        open_session(member("client", endpoint, authority, authority.issue("trainer"))) as trainer,
+        open_session(member("client", endpoint, authority, authority.issue("worker"))) as worker,
+    ):
+        queryable = trainer.declare_queryable(keys.demonstration_commit("e"), answer, complete=True)
+        request, response_type = demonstration_pb2.CommitEpisodeRequest(), demonstration_pb2.CommitEpisodeResponse
+        response = ask(worker, keys.demonstration_commit("e"), request, response_type, READY_SECONDS)
+        assert response.missing_steps == [7]
+        queryable.undeclare()
+
+
+def test_nobody_else_gets_in(authority: Authority, endpoint: str, tmp_path: Path) -> None:
+    others = Authority(tmp_path / "others")
+    nameless = tmp_path / "nameless.json5"
+    tls = {"root_ca_certificate": str(authority.certificate)}
+    nameless.write_text(json.dumps({"transport": {"link": {"tls": tls}}}))
+    plain = endpoint.replace("tls/", "tcp/")
+    with open_session(member("router", endpoint, authority, authority.issue("router"))) as router:
+        without = ZenohConfig(mode="client", connect=(endpoint,), zenoh_config=nameless)
+        assert "certificate required" in refusal_of(without).replace("_", " ").lower()
+        # The authority of ours is public; the certificate is what counts.
+        assert "unknown ca" in refusal_of(member("client", endpoint, authority, others.issue("worker"))).lower()
+        late = member("client", endpoint, authority, authority.issue("late", expired=True))
+        assert "certificate expired" in refusal_of(late).replace("_", " ").lower()
+        assert "it may ask for TLS" in refusal_of(ZenohConfig(mode="client", connect=(plain,)))
+        assert not router.info.transports()
+
+
+@pytest.mark.parametrize(
+    ("name", "host", "expired", "reason"),
+    [
+        ("stranger", "localhost", False, "unable to get local issuer certificate"),
+        ("router", "elsewhere", False, "Hostname mismatch"),
+        ("router", "localhost", True, "certificate has expired"),
+    ],
+)
+def test_router_that_cannot_prove_its_name_is_not_joined(
+    name: str, host: str, expired: bool, reason: str, authority: Authority, endpoint: str, tmp_path: Path
+) -> None:
+    others = Authority(tmp_path / "others")
+    files = (others if name == "stranger" else authority).issue(name, host, expired=expired)
+    with open_session(member("router", endpoint, authority, files)):
+        assert reason in refusal_of(member("client", endpoint, authority, authority.issue("worker")))
+
+
+def test_router_without_tls_is_not_joined(authority: Authority, endpoint: str) -> None:
+    with open_session(ZenohConfig(mode="router", listen=(endpoint.replace("tls/", "tcp/"),))):
+        assert "no router answers" in refusal_of(member("client", endpoint, authority, authority.issue("worker")))
+
+
+def test_loss_of_a_router_over_tls_is_mended(authority: Authority, endpoint: str, session_log: Log) -> None:
+    routing = member("router", endpoint, authority, authority.issue("router"))
+    with ExitStack() as stack:
+        with open_session(routing):
+            client = stack.enter_context(open_session(member("client", endpoint, authority, authority.issue("worker"))))
+        wait_for(lambda: session_log.says("no router or peer is connected"))
+        with open_session(routing):
+            wait_for(lambda: is_connected(client))
+
+
+def test_files_at_fault_are_refused_before_anything_is_joined(
+    authority: Authority, endpoint: str, tmp_path: Path
+) -> None:
+    certificate, private_key = authority.issue("worker")
+    _, another_key = authority.issue("another")
+    garbage = tmp_path / "garbage.pem"
+    garbage.write_text("garbage")
+    with pytest.raises(ConfigError, match=r"--tls-private-key \(CPN_TLS_PRIVATE_KEY\): .*missing\.key: No such file"):
+        zenoh_config(member("client", endpoint, authority, (certificate, tmp_path / "missing.key")))
+    for files in ((certificate, another_key), (garbage, private_key), (certificate, garbage)):
+        with pytest.raises(ConfigError, match=r"--tls-certificate \(CPN_TLS_CERTIFICATE\) .*, got "):
+            zenoh_config(member("client", endpoint, authority, files))
+    authority.certificate.write_text("garbage")
+    with pytest.raises(ConfigError, match=r"--tls-ca \(CPN_TLS_CA\) .*, got "):
+        zenoh_config(member("client", endpoint, authority, (certificate, private_key)))
