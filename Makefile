@@ -10,7 +10,7 @@ OPENPI := tests/openpi/.venv
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
+.PHONY: help setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -57,6 +57,14 @@ jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint erro
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	scripts/models.sh
+
+sign-models: | $(UV) ## Sign the shipped checkpoints (KEY=private key in PEM), and write their public key
+	@test -f "$(KEY)" || { echo "KEY: expected a file with a private key in PEM, got \"$(KEY)\"" >&2; exit 1; }
+	openssl ec -in "$(KEY)" -pubout -out models/cpn-models.pub.pem
+	for model in models/*.safetensors; do \
+		$(UV) tool run --quiet --from model-signing==1.1.1 --with pyopenssl==26.4.0 model_signing sign key \
+			--private_key "$(KEY)" --signature "$$model.sig" "$$model" || exit 1; \
+	done
 
 export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (DATASET=folder, OUT=folder)
 	$(EXPORT)/bin/cpn-export-lerobot --dataset $(or $(DATASET),data/demonstrations) --out $(or $(OUT),data/lerobot)
