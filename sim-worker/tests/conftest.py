@@ -73,3 +73,9 @@ def session_log() -> Iterator[Log]:
     yield handler
     logger.removeHandler(handler)
     logger.setLevel(level)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warnings that come soon, in this process."""
+    monkeypatch.setattr("cpn_sim_worker.session.REMINDER_SECONDS", 0.3)

@@ -4,8 +4,10 @@ import random
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from cpn.v1 import types_pb2
+from cpn_sim_worker.session import StoppedError, ZenohConfig, open_session
 
 COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker"))
 HEALTH_COMMAND = str(Path(sys.executable).with_name("cpn-sim-worker-health"))
@@ -58,6 +61,14 @@ def free_endpoint(protocol: str = "tcp", host: str = "127.0.0.1") -> str:
             return f"{protocol}/{host}:{port}"
 
 
+def router(endpoint: str) -> ZenohConfig:
+    return ZenohConfig(mode="router", listen=(endpoint,))
+
+
+def client(*endpoints: str) -> ZenohConfig:
+    return ZenohConfig(mode="client", connect=endpoints)
+
+
 def wait_for(condition: Callable[[], object]) -> None:
     """Waits until the condition holds."""
     end = time.monotonic() + READY_SECONDS
@@ -78,3 +89,22 @@ class Log(logging.Handler):
 
     def says(self, text: str) -> bool:
         return any(text in line for line in self.lines)
+
+
+def assert_not_let_in(options: ZenohConfig, log: Log, reason: str) -> None:
+    """Tries to join as a client until the log gives the reason for the refusal."""
+    log.lines.clear()
+    joined, stop = threading.Event(), threading.Event()
+
+    def join() -> None:
+        with suppress(StoppedError), open_session(options, stop):
+            joined.set()
+
+    thread = threading.Thread(target=join)
+    thread.start()
+    try:
+        wait_for(lambda: joined.is_set() or log.says(reason))
+    finally:
+        stop.set()
+        thread.join()
+    assert not joined.is_set()

@@ -3,6 +3,7 @@ import subprocess
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,12 @@ from cpn.v1 import demonstration_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.demonstrate import DemonstrateConfig
 from cpn_sim_worker.scene import Transition
+from cpn_sim_worker.session import open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.stream import digest
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
 from cpn_sim_worker.wire import action_from_proto, decode, encoding
-from tests.support import COMMAND, UNSOLVED, pixels
+from tests.support import COMMAND, UNSOLVED, client, free_endpoint, pixels, router, wait_for
 
 Step = demonstration_pb2.DemonstrationStep
 ROOT = Path(__file__).resolve().parents[2]
@@ -122,6 +124,31 @@ def test_slow_trainer_gets_everything(trainer: Trainer, endpoint: str) -> None:
     run = demonstrate(endpoint, "--tasks", "coffee-button", "--episodes", "1")
     assert run.returncode == 0, run.stderr
     assert set(trainer.kept) == {"coffee-button-0"}
+
+
+def test_episodes_survive_the_loss_of_their_router() -> None:
+    endpoint = free_endpoint()
+    command = [COMMAND, "demonstrate", "--mode", "client", "--connect", endpoint]
+    command += ["--tasks", "coffee-button", "--episodes", "2"]
+    with ExitStack() as stack:
+        # Nobody routes yet.
+        process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        stack.callback(process.kill)
+        with open_session(router(endpoint)):
+            trainer = Trainer(stack.enter_context(open_session(client(endpoint))))
+            stack.callback(trainer.close)
+            # The router is lost while steps are under way.
+            trainer.seconds_per_step = 0.5
+            wait_for(lambda: len(trainer.received) > 2)
+        received = len(trainer.received)
+        assert not trainer.kept
+        trainer.seconds_per_step = 0.0
+        with open_session(router(endpoint)):
+            output, _ = process.communicate()
+            assert process.returncode == 0
+    assert "coffee-button: 2 episodes of 2 tries, 0 rejected" in output
+    assert set(trainer.kept) == {"coffee-button-0", "coffee-button-1"}
+    assert len(trainer.received) > received
 
 
 def test_digest_is_the_same_in_every_language() -> None:

@@ -1,8 +1,10 @@
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -11,12 +13,24 @@ import zenoh
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.episode import EpisodeRunner, _Episode
-from cpn_sim_worker.server import QUEUE_LENGTH, ServeConfig, SimServer
-from cpn_sim_worker.session import UnavailableError, ask
+from cpn_sim_worker.server import QUEUE_LENGTH, NameTakenError, ServeConfig, SimServer, claim_name
+from cpn_sim_worker.session import StoppedError, UnavailableError, ZenohConfig, ask, is_connected, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
 from cpn_sim_worker.wire import MAX_PAYLOAD_BYTES, RequestError, decode, encoding
-from tests.support import READY_SECONDS, UNSOLVED, StartWorker, collect, pixels, wait_for_sample
+from tests.support import (
+    COMMAND,
+    READY_SECONDS,
+    UNSOLVED,
+    StartWorker,
+    client,
+    collect,
+    free_endpoint,
+    pixels,
+    router,
+    wait_for,
+    wait_for_sample,
+)
 
 SEED = FIRST_EVALUATION_SEED + 1
 REST = (0.0, 0.0, 0.0, 0.0)
@@ -246,6 +260,61 @@ def test_fault_in_a_request_is_answered_and_ends_the_episode(session: zenoh.Sess
         stop.set()
         thread.join()
         alive.undeclare()
+
+
+def test_worker_is_found_again_after_its_router(simulator: Simulator) -> None:
+    endpoint = free_endpoint()
+    command = [COMMAND, "serve", "--worker", "routed", "--mode", "client", "--connect", endpoint]
+    with ExitStack() as stack, subprocess.Popen(command) as process:
+        stack.callback(process.terminate)
+        # The worker waits for its router at first, and loses it later.
+        with open_session(router(endpoint)):
+            session = stack.enter_context(open_session(client(endpoint)))
+            wait_for(lambda: list(session.liveliness().get(keys.sim_alive("routed"), timeout=READY_SECONDS)))
+            start = Worker(session, "routed").reset()
+        with open_session(router(endpoint)):
+            wait_for(lambda: is_connected(session))
+            wait_for(lambda: list(session.liveliness().get(keys.sim_alive("routed"), timeout=READY_SECONDS)))
+            response = Worker(session, "routed").step(start.episode_id, 0)
+            simulator.reset("reach", SEED)
+            simulator.step(np.array(REST, np.float32))
+            assert np.array_equal(pixels(response.observation), simulator.frame())
+            os.kill(process.pid, signal.SIGTERM)
+            assert process.wait(timeout=READY_SECONDS) == 0
+
+
+def test_second_worker_of_a_name_is_refused(session: zenoh.Session, start_worker: StartWorker, endpoint: str) -> None:
+    start_worker("twin")
+    command = [COMMAND, "serve", "--worker", "twin", "--connect", endpoint]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert "worker: expected a name that no running worker has, got 'twin'" in run.stderr
+    assert "stop the other worker, or give this one another --worker" in run.stderr
+    Worker(session, "twin").reset()
+
+
+def test_name_of_a_worker_that_died_is_taken_over(session: zenoh.Session, endpoint: str) -> None:
+    config = ServeConfig(worker="late", zenoh=ZenohConfig(connect=(endpoint,)))
+    stop = threading.Event()
+    with open_session(config.zenoh) as heir:
+        claim_name(heir, config, stop)
+        lingering = session.liveliness().declare_token(keys.sim_alive("late"))
+        wait_for(lambda: list(heir.liveliness().get(keys.sim_alive("late"), timeout=READY_SECONDS)))
+        with pytest.raises(NameTakenError, match="got 'late'"):
+            claim_name(heir, config, stop, patience_seconds=0)
+
+        claims = threading.Thread(target=claim_name, args=(heir, config, stop, READY_SECONDS))
+        claims.start()
+        lingering.undeclare()
+        claims.join(READY_SECONDS)
+        assert not claims.is_alive()
+
+        lingering = session.liveliness().declare_token(keys.sim_alive("late"))
+        wait_for(lambda: list(heir.liveliness().get(keys.sim_alive("late"), timeout=READY_SECONDS)))
+        stop.set()
+        with pytest.raises(StoppedError):
+            claim_name(heir, config, stop)
+        lingering.undeclare()
 
 
 @pytest.mark.parametrize(
