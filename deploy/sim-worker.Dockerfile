@@ -38,13 +38,14 @@ RUN /uv/bin/uv sync --quiet --locked --no-dev --no-editable ${EXTRAS}
 # Decimated meshes of every task, so that a worker finds them and writes nothing.
 ENV XDG_CACHE_HOME=/cache MUJOCO_GL=egl PYTHONDONTWRITEBYTECODE=1
 COPY deploy/sim-worker/warm_meshes.py /warm_meshes.py
-RUN /opt/cpn/bin/python /warm_meshes.py
+RUN /opt/cpn/bin/python /warm_meshes.py && chmod -R a+rX /cache
 
 FROM python
 
 COPY --from=build /opt/cpn /opt/cpn
 COPY --from=build /cache /cache
-ENV PATH=/opt/cpn/bin:$PATH XDG_CACHE_HOME=/cache MUJOCO_GL=egl PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
+ENV PATH=/opt/cpn/bin:$PATH XDG_CACHE_HOME=/cache MUJOCO_GL=egl MESA_SHADER_CACHE_DISABLE=true PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1
 USER 10001:10001
 ENTRYPOINT ["cpn-sim-worker"]
 CMD ["serve"]
