@@ -1,6 +1,5 @@
 """Plans of positions, as the planner answers them."""
 
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -44,8 +43,7 @@ class Demonstration:
 @contextmanager
 def network(endpoint: str, *services: str) -> Iterator[zenoh.Session]:
     """A session in the namespace of this run, once the services of these liveliness keys are there."""
-    config = ZenohConfig(connect=(endpoint,), namespace=os.environ.get("CPN_NAMESPACE"))
-    with open_session(config) as session:
+    with open_session(ZenohConfig(connect=(endpoint,))) as session:
         deadline = time.monotonic() + START_SECONDS
         for key in services:
             while not any(reply.ok is not None for reply in session.liveliness().get(key, timeout=1.0)):
