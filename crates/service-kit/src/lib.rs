@@ -1,12 +1,16 @@
-//! What every service needs around its work: configuration, files, logs, metrics, shutdown, gRPC, a zenoh session.
+//! What every service needs around its work: configuration, files, logs, metrics, shutdown, a zenoh session, and listeners
+//! with TLS and access control for gRPC and others.
 
+pub mod access;
 pub mod config;
 pub mod files;
 pub mod grpc;
+pub mod listener;
 pub mod metrics;
 pub mod session;
 pub mod shutdown;
 pub mod telemetry;
+pub mod tls;
 
 pub use grpc::GrpcServer;
 pub use session::SessionConfig;

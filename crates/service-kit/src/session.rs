@@ -1,54 +1,344 @@
-//! Opening a zenoh session.
+//! Joining a zenoh network, and knowing whether one is joined.
 
-use anyhow::{Context, anyhow};
+use crate::listener::{self, ListenConfig};
+use crate::tls::Tls;
+use anyhow::{Context, anyhow, bail, ensure};
+use clap::builder::FalseyValueParser;
+use metrics::gauge;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
+use serde_json::{Value, json};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval};
+use tokio_util::task::AbortOnDropHandle;
+use tracing::{info, warn};
+use zenoh::Session;
+use zenoh::key_expr::OwnedKeyExpr;
+
+/// Interval between two messages that nobody is connected.
+const REMINDER: Duration = Duration::from_secs(5);
+/// Interval between two looks at the connections.
+const LOOK: Duration = Duration::from_millis(500);
+/// Time that the liveliness token of a process that has died may linger: zenoh's lease, and some more.
+const LEASE: Duration = Duration::from_secs(15);
+/// Largest message that is put together from fragments: a request to load a model may carry its checkpoint.
+const MAX_MESSAGE_BYTES: usize = 66 << 20;
+
+/// Role of a session in its network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Mode {
+    /// Talks to other peers directly; they find each other by gossip.
+    #[default]
+    Peer,
+    /// Talks through one router.
+    Client,
+    /// Passes on what others send.
+    Router,
+}
 
 /// How a process joins the others. What is left empty is not serialised, so that it can stand in a layer of
 /// configuration and on a command line alike.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct SessionConfig {
-    /// Endpoints to connect to, for example tcp/127.0.0.1:7447.
+    /// Zenoh mode [default: peer].
+    #[arg(long, env = "CPN_MODE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mode: Option<Mode>,
+    /// Endpoints to connect to, for example tcp/127.0.0.1:7447 or tls/router:7447.
     #[arg(long, env = "CPN_CONNECT", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub connect: Vec<String>,
-    /// Endpoints to listen on; any free port of the loopback interface if none is given.
+    /// Endpoints to listen on [default: any free port of the loopback interface; none for a client].
     #[arg(long, env = "CPN_LISTEN", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub listen: Vec<String>,
-    /// Passes large payloads to processes on the same machine by shared memory; for sessions that stay, since zenoh keeps what
-    /// ended ones shared.
-    #[arg(long, env = "CPN_SHARED_MEMORY")]
+    /// Shared memory for large payloads between processes of one machine. Only for long-lived sessions: zenoh never unmaps what
+    /// closed sessions shared.
+    #[arg(long, env = "CPN_SHARED_MEMORY", value_parser = FalseyValueParser::new())]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub shared_memory: bool,
-    /// Key prefix that keeps this run's messages apart from those of others.
+    /// Prefix of every key, which keeps apart runs that share a network.
     #[arg(long, env = "CPN_NAMESPACE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub namespace: Option<String>,
+    /// Zenoh's own configuration file, in place of the defaults here; options that are given win over it.
+    #[arg(long, env = "ZENOH_CONFIG", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zenoh_config: Option<PathBuf>,
+    /// User name for routers that ask for one.
+    #[arg(long, env = "CPN_USER", requires = "password_file")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub user: Option<String>,
+    /// File with the user's password.
+    #[arg(long, env = "CPN_PASSWORD_FILE", value_name = "FILE", requires = "user")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub password_file: Option<PathBuf>,
+    /// Certificate authority of everybody in the network, in PEM.
+    #[arg(long, env = "CPN_TLS_CA", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_ca: Option<PathBuf>,
+    /// Certificate of this process, in PEM, for all that it connects to and listens on.
+    #[arg(long, env = "CPN_TLS_CERTIFICATE", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_certificate: Option<PathBuf>,
+    /// Private key of the certificate, in PEM.
+    #[arg(long, env = "CPN_TLS_PRIVATE_KEY", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_private_key: Option<PathBuf>,
+    /// List of the authority's revoked certificates, in PEM, for gRPC, openpi and metrics.
+    #[arg(long, env = "CPN_TLS_CRL", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_crl: Option<PathBuf>,
+    /// Allows listening beyond the loopback interface without TLS.
+    #[arg(long, env = "CPN_INSECURE", value_parser = FalseyValueParser::new())]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub insecure: bool,
 }
 
-/// Opens a session in peer mode. Peers find each other by gossip from one known endpoint, never by multicast, which
-/// fails without a word in containers. An endpoint that is not up yet is tried again for as long as the session lives.
+impl SessionConfig {
+    /// The TLS files, if any are given.
+    ///
+    /// # Errors
+    /// If only some of authority, certificate and private key are given.
+    pub fn tls(&self) -> anyhow::Result<Option<Tls>> {
+        match (&self.tls_ca, &self.tls_certificate, &self.tls_private_key) {
+            (None, None, None) => {
+                ensure!(
+                    self.tls_crl.is_none(),
+                    "tls_crl: expected tls_ca, tls_certificate and tls_private_key with it"
+                );
+                Ok(None)
+            }
+            (Some(ca), Some(certificate), Some(private_key)) => Ok(Some(Tls {
+                ca: ca.clone(),
+                certificate: certificate.clone(),
+                private_key: private_key.clone(),
+                crl: self.tls_crl.clone(),
+            })),
+            (ca, certificate, private_key) => {
+                let got = [("tls_ca", ca), ("tls_certificate", certificate), ("tls_private_key", private_key)];
+                let missing: Vec<_> = got.iter().filter(|(_, file)| file.is_none()).map(|(name, _)| *name).collect();
+                bail!("{}: expected a file, as other TLS files are given, got none", missing.join(", "))
+            }
+        }
+    }
+
+    /// What a listener at an address is told: the same TLS files as zenoh.
+    ///
+    /// # Errors
+    /// If only some of authority, certificate and private key are given.
+    pub fn listen_at(&self, address: SocketAddr, max_connections: usize) -> anyhow::Result<ListenConfig> {
+        Ok(ListenConfig { address, tls: self.tls()?, insecure: self.insecure, max_connections })
+    }
+
+    /// Zenoh's configuration.
+    ///
+    /// # Errors
+    /// If a setting is malformed, a file cannot be read, or an endpoint listens beyond the loopback interface in plain text.
+    pub fn zenoh(&self) -> anyhow::Result<zenoh::Config> {
+        let mut zenoh = match &self.zenoh_config {
+            Some(file) => {
+                zenoh::Config::from_file(file).map_err(|e| anyhow!("zenoh_config {}: {e}", file.display()))?
+            }
+            None => defaults()?,
+        };
+        if let Some(mode) = self.mode {
+            set(&mut zenoh, "mode", json!(mode))?;
+        }
+        for (key, endpoints) in [("connect/endpoints", &self.connect), ("listen/endpoints", &self.listen)] {
+            if !endpoints.is_empty() {
+                set(&mut zenoh, key, json!(endpoints))?;
+            }
+        }
+        if self.shared_memory || self.zenoh_config.is_none() {
+            set(&mut zenoh, "transport/shared_memory/enabled", json!(self.shared_memory))?;
+        }
+        if let Some(namespace) = &self.namespace {
+            set(&mut zenoh, "namespace", json!(namespace))?;
+        }
+        if let (Some(user), Some(file)) = (&self.user, &self.password_file) {
+            let password =
+                std::fs::read_to_string(file).with_context(|| format!("password_file {}", file.display()))?;
+            set(&mut zenoh, "transport/auth/usrpwd/user", json!(user))?;
+            // The error of a refused value would print it.
+            zenoh
+                .insert_json5("transport/auth/usrpwd/password", &json!(password.trim_end_matches('\n')).to_string())
+                .map_err(|_| anyhow!("password_file {}: expected a password, got none", file.display()))?;
+        }
+        if let Some(tls) = self.tls()? {
+            for (key, file) in [
+                ("root_ca_certificate", &tls.ca),
+                ("listen_certificate", &tls.certificate),
+                ("connect_certificate", &tls.certificate),
+                ("listen_private_key", &tls.private_key),
+                ("connect_private_key", &tls.private_key),
+            ] {
+                set(&mut zenoh, &format!("transport/link/tls/{key}"), json!(file))?;
+            }
+            set(&mut zenoh, "transport/link/tls/enable_mtls", json!(true))?;
+            set(&mut zenoh, "transport/link/tls/close_link_on_expiration", json!(true))?;
+        }
+        self.check_endpoints(&zenoh)?;
+        Ok(zenoh)
+    }
+
+    /// Refuses endpoints that listen beyond the loopback interface in plain text, and a client without a router.
+    fn check_endpoints(&self, zenoh: &zenoh::Config) -> anyhow::Result<()> {
+        let mode = get(zenoh, "mode")?.as_str().unwrap_or("peer").to_owned();
+        if mode == "client" && endpoints(zenoh, "connect/endpoints", &mode)?.is_empty() {
+            let scouts = get(zenoh, "scouting/multicast/enabled")? == json!(true);
+            ensure!(scouts, "connect: expected the endpoint of a router, as the mode is client, got none");
+        }
+        for endpoint in endpoints(zenoh, "listen/endpoints", &mode)? {
+            let (protocol, address) = endpoint.split_once('/').unwrap_or((&endpoint, ""));
+            let encrypted = matches!(protocol, "tls" | "quic");
+            let local = protocol.starts_with("unix") || listener::is_loopback(address);
+            ensure!(
+                encrypted || local || self.insecure,
+                "listen: expected a tls/ endpoint beyond the loopback interface, or insecure to be set, got {endpoint}"
+            );
+        }
+        Ok(())
+    }
+}
+
+/// Peers find each other by gossip from one known endpoint, never by multicast, which fails without a word in
+/// containers. An endpoint that is not up yet is tried again for as long as the session lives.
+fn defaults() -> anyhow::Result<zenoh::Config> {
+    let mut zenoh = zenoh::Config::default();
+    set(&mut zenoh, "mode", json!("peer"))?;
+    set(&mut zenoh, "scouting/multicast/enabled", json!(false))?;
+    set(&mut zenoh, "scouting/gossip/enabled", json!(true))?;
+    set(&mut zenoh, "connect/timeout_ms", json!(-1))?;
+    set(&mut zenoh, "connect/exit_on_failure", json!(false))?;
+    set(
+        &mut zenoh,
+        "connect/retry",
+        json!({"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}),
+    )?;
+    let any_port = json!(["tcp/127.0.0.1:0"]);
+    set(&mut zenoh, "listen/endpoints", json!({"peer": any_port, "router": any_port, "client": []}))?;
+    set(&mut zenoh, "transport/link/rx/max_message_size", json!(MAX_MESSAGE_BYTES))?;
+    Ok(zenoh)
+}
+
+fn set(config: &mut zenoh::Config, key: &str, value: Value) -> anyhow::Result<()> {
+    config.insert_json5(key, &value.to_string()).map_err(|e| anyhow!("zenoh {key} = {value}: {e}"))
+}
+
+fn get(config: &zenoh::Config, key: &str) -> anyhow::Result<Value> {
+    let text = config.get_json(key).map_err(|e| anyhow!("zenoh {key}: {e}"))?;
+    serde_json::from_str(&text).with_context(|| format!("zenoh {key}"))
+}
+
+/// The endpoints of a mode: zenoh holds one list for all modes, or one for each.
+fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Vec<String>> {
+    fn collect(value: &Value, found: &mut Vec<String>) {
+        match value {
+            Value::String(endpoint) => found.push(endpoint.clone()),
+            Value::Array(values) => values.iter().for_each(|value| collect(value, found)),
+            _ => (),
+        }
+    }
+    let value = get(config, key)?;
+    let of_mode = value.get(mode).unwrap_or(&value);
+    let mut found = Vec::new();
+    collect(of_mode, &mut found);
+    Ok(found)
+}
+
+/// Opens a session. A client waits for its router, and says so every few seconds.
 ///
 /// # Errors
-/// If an endpoint is malformed or cannot be listened on.
-pub async fn open(config: &SessionConfig) -> anyhow::Result<zenoh::Session> {
-    let mut zenoh_config = zenoh::Config::default();
-    let mut set = |key: &str, value: serde_json::Value| {
-        zenoh_config.insert_json5(key, &value.to_string()).map_err(|e| anyhow!("zenoh {key} = {value}: {e}"))
-    };
-    set("mode", json!("peer"))?;
-    set("scouting/multicast/enabled", json!(false))?;
-    set("scouting/gossip/enabled", json!(true))?;
-    set("connect/endpoints", json!(config.connect))?;
-    set("connect/timeout_ms", json!(-1))?;
-    set("connect/exit_on_failure", json!(false))?;
-    let any_port = ["tcp/127.0.0.1:0".to_owned()];
-    set("listen/endpoints", json!(if config.listen.is_empty() { &any_port[..] } else { &config.listen[..] }))?;
-    set("transport/shared_memory/enabled", json!(config.shared_memory))?;
-    if let Some(namespace) = &config.namespace {
-        set("namespace", json!(namespace))?;
+/// If a setting is malformed, a file cannot be read, an endpoint cannot be listened on, or listens beyond the loopback
+/// interface in plain text.
+pub async fn open(config: &SessionConfig) -> anyhow::Result<Session> {
+    let zenoh = config.zenoh()?;
+    let reached = endpoints(&zenoh, "connect/endpoints", get(&zenoh, "mode")?.as_str().unwrap_or("peer"))?.join(", ");
+    let opening = async { zenoh::open(zenoh).await.map_err(|e| anyhow!(e)).context("opening the zenoh session") };
+    tokio::pin!(opening);
+    let mut reminder = interval(REMINDER);
+    reminder.tick().await;
+    loop {
+        tokio::select! {
+            session = &mut opening => return session,
+            _ = reminder.tick() => warn!(endpoints = reached, "no router answers; trying again"),
+        }
     }
-    zenoh::open(zenoh_config).await.map_err(|e| anyhow!(e)).context("opening the zenoh session")
+}
+
+/// Whether a router or a peer is connected.
+pub async fn is_connected(session: &Session) -> bool {
+    let info = session.info();
+    info.routers_zid().await.next().is_some() || info.peers_zid().await.next().is_some()
+}
+
+/// The connection of a session that has somebody to connect to.
+#[derive(Debug)]
+pub struct Connection {
+    connected: watch::Receiver<bool>,
+    _task: AbortOnDropHandle<()>,
+}
+
+impl Connection {
+    /// Follows a session: warns every few seconds while nobody is connected, and keeps the gauge `cpn_zenoh_connected`.
+    pub fn follow(session: &Session, config: &SessionConfig) -> Self {
+        let (told, connected) = watch::channel(true);
+        let (session, alone) = (session.clone(), config.connect.is_empty());
+        let task = AbortOnDropHandle::new(tokio::spawn(async move {
+            let mut look = interval(LOOK);
+            look.set_missed_tick_behavior(MissedTickBehavior::Skip);
+            let mut reminded = None;
+            while !session.is_closed() {
+                look.tick().await;
+                let connected = alone || is_connected(&session).await;
+                gauge!("cpn_zenoh_connected").set(if connected { 1.0 } else { 0.0 });
+                let changed = told.send_if_modified(|told| std::mem::replace(told, connected) != connected);
+                if connected {
+                    if changed {
+                        info!("connected to the zenoh network again");
+                    }
+                    reminded = None;
+                } else if reminded.is_none_or(|last: Instant| last.elapsed() >= REMINDER) {
+                    warn!("no router or peer is connected; trying again");
+                    reminded = Some(Instant::now());
+                }
+            }
+        }));
+        Self { connected, _task: task }
+    }
+
+    /// Whether somebody is connected, and each change of it.
+    pub fn connected(&self) -> watch::Receiver<bool> {
+        self.connected.clone()
+    }
+}
+
+/// Waits until nobody holds a liveliness token: that of a process that was killed lingers for a while.
+///
+/// # Errors
+/// If somebody holds it for longer than zenoh's lease: two services of one name would each get a part of the requests.
+pub async fn claim(session: &Session, config: &SessionConfig, token: &OwnedKeyExpr) -> anyhow::Result<()> {
+    let start = Instant::now();
+    // Before the first connection nobody else can be seen.
+    while !config.connect.is_empty() && !is_connected(session).await && start.elapsed() < Duration::from_secs(1) {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let mut waiting = false;
+    loop {
+        let holders = session.liveliness().get(token).timeout(Duration::from_secs(2)).await.map_err(|e| anyhow!(e))?;
+        if holders.recv_async().await.is_err() {
+            return Ok(());
+        }
+        ensure!(start.elapsed() < LEASE, "name: expected one that no running service has, got that of {token}");
+        if !waiting {
+            warn!(%token, "a service of this name is running or has just died; waiting for it to go");
+            waiting = true;
+        }
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
 }

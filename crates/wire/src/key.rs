@@ -66,6 +66,8 @@ keys! {
     trainer_list_runs(trainer) = "cpn/@v1/trainer/${trainer:*}/list_runs";
     /// Published [`crate::training::Run`].
     training_progress(run) = "cpn/@v1/training/${run:*}/progress";
+    /// Liveliness token of a trainer's service.
+    trainer_alive(trainer) = "cpn/@v1/alive/trainer/${trainer:*}";
     /// Liveliness token of a planner.
     planner_alive(planner) = "cpn/@v1/alive/planner/${planner:*}";
     /// Liveliness token of a simulator worker.

@@ -3,6 +3,7 @@
 //! Bytes become native types here and nowhere else: [`decode`] bounds the size, parses, and checks every field, so that
 //! the services see valid values only. Each message has both directions, held to each other by a property test.
 
+pub mod access;
 pub mod checkpoint;
 pub mod demonstration;
 mod error;

@@ -17,8 +17,8 @@ pub fn encoding<N: Name>() -> Encoding {
 /// Sends a request and awaits its one answer.
 ///
 /// # Errors
-/// What the service answered; [`Code::Unavailable`] if nobody serves the key; [`Code::DeadlineExceeded`] if no answer
-/// came in time.
+/// What the service answered; [`Code::Unavailable`] if nobody serves the key, or, about the field `session`, if no router or
+/// peer is connected; [`Code::DeadlineExceeded`] if no answer came in time.
 pub async fn call<Q: Message, R: Message>(
     session: &Session,
     key: &OwnedKeyExpr,
@@ -38,11 +38,22 @@ pub async fn call<Q: Message, R: Message>(
             .map_err(unavailable)?;
         // Right after a reconnect a query can end at once without any reply.
         let Ok(reply) = replies.recv_async().await else {
-            return Err(Error::new(Code::Unavailable, key.as_str(), "a service", "none connected"));
+            return Err(nobody(session, key).await);
         };
         decode_reply(reply, key, timeout)
     };
     ask.instrument(debug_span!("query", otel.kind = "client", %key)).await
+}
+
+/// Why there is no answer: nobody to ask, or nobody who serves the key, or none that may be asked.
+async fn nobody(session: &Session, key: &OwnedKeyExpr) -> Error {
+    let info = session.info();
+    let connected = info.routers_zid().await.next().is_some() || info.peers_zid().await.next().is_some();
+    if connected {
+        Error::new(Code::Unavailable, key.as_str(), "a service that may be asked", "none connected")
+    } else {
+        Error::new(Code::Unavailable, "session", "a router or peer", "none connected")
+    }
 }
 
 /// Asks, without a payload, for everything at a key, and awaits every answer, in the order they come; several services

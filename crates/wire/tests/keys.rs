@@ -25,6 +25,7 @@ fn keys_are_the_ones_agreed_upon() {
             "planner_register_goal" => key::planner_register_goal(&chunk("planner")),
             "planner_load_model" => key::planner_load_model(&chunk("planner")),
             "planner_list_models" => key::planner_list_models(&chunk("planner")),
+            "trainer_alive" => key::trainer_alive(&chunk("trainer")),
             "planner_alive" => key::planner_alive(&chunk("planner")),
             "trainer_start_run" => key::trainer_start_run(&chunk("trainer")),
             "trainer_stop_run" => key::trainer_stop_run(&chunk("trainer")),
@@ -39,7 +40,7 @@ fn keys_are_the_ones_agreed_upon() {
         };
         assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
     }
-    assert_eq!(golden.len(), 22, "every key is in the file");
+    assert_eq!(golden.len(), 23, "every key is in the file");
 }
 
 #[test]

@@ -37,6 +37,8 @@ pub struct Config {
     pub precision: Precision,
     /// Where Prometheus finds metrics; none are served if it is not given.
     pub metrics_listen: Option<SocketAddr>,
+    /// File of the tokens that clients of gRPC, openpi and metrics may bear instead of a certificate.
+    pub tokens: Option<PathBuf>,
     /// How the planner joins the others over zenoh.
     pub session: SessionConfig,
 }
@@ -59,6 +61,7 @@ impl Default for Config {
             threads: count(1),
             precision: Precision::Float32,
             metrics_listen: None,
+            tokens: None,
             session: SessionConfig::default(),
         }
     }
@@ -123,6 +126,10 @@ pub struct Args {
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub metrics_listen: Option<SocketAddr>,
+    /// File of the tokens that clients of gRPC, openpi and metrics may bear instead of a certificate [default: none].
+    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tokens: Option<PathBuf>,
     /// How to join the others.
     #[command(flatten)]
     pub session: SessionConfig,

@@ -2,13 +2,15 @@
 
 use crate::core::PlannerCore;
 use service_kit::GrpcServer;
+use service_kit::access::Access;
+use service_kit::listener::ListenConfig;
 use std::future::ready;
-use std::net::SocketAddr;
 use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status};
 use tower::util::MapResponseLayer;
 use tracing::{Instrument, debug_span};
+use wire::access::may_call;
 use wire::grpc::{answer, name_unreadable_payload};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::proto::planner_service_server::{PlannerService, PlannerServiceServer};
@@ -21,15 +23,15 @@ const LOAD_MODEL_PATH: &str = "/cpn.v1.PlannerService/LoadModel";
 /// Listens and answers; healthy once it is told to be.
 ///
 /// # Errors
-/// If the address cannot be listened on.
-pub(crate) async fn start(core: PlannerCore, listen: SocketAddr) -> anyhow::Result<GrpcServer> {
+/// If the address cannot be listened on, or is beyond the loopback interface without TLS.
+pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Access) -> anyhow::Result<GrpcServer> {
     let service = |limit| PlannerServiceServer::new(Grpc(core.clone())).max_decoding_message_size(limit);
     let planner = Routes::new(service(PlanRequest::MAX_BYTES))
         .into_axum_router()
         .route_service(LOAD_MODEL_PATH, service(LoadModelRequest::MAX_BYTES))
         .layer(MapResponseLayer::new(name_unreadable_payload));
     let name = PlannerServiceServer::<Grpc>::NAME;
-    GrpcServer::start(listen, name, proto::DESCRIPTORS, Routes::from(planner)).await
+    GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(planner)).await
 }
 
 /// The generated service, by the core.

@@ -24,10 +24,13 @@ use crate::zenoh::ZenohServer;
 pub use config::Config;
 #[doc(hidden)]
 pub use openpi::request as openpi_request; // for the fuzzer
+use service_kit::access::Access;
+use service_kit::session::Connection;
 use service_kit::{GrpcServer, metrics};
 use std::net::SocketAddr;
 use std::time::Duration;
 use tracing::{info, warn};
+use wire::access;
 
 /// How long requests in flight may take to finish at shutdown.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
@@ -39,6 +42,7 @@ pub struct Planner {
     grpc: GrpcServer,
     openpi: Option<OpenpiServer>,
     zenoh: ZenohServer,
+    connection: Connection,
 }
 
 /// Loads the models and serves them; when this returns, everything answers.
@@ -46,21 +50,30 @@ pub struct Planner {
 /// Wants tokio's multi-threaded runtime: zenoh panics on the other.
 ///
 /// # Errors
-/// If a checkpoint is faulty, an address cannot be listened on, the name cannot stand in a key, or metrics are asked for twice
-/// in a process.
+/// If a checkpoint is faulty, an address cannot be listened on, or is beyond the loopback interface without TLS, the name cannot
+/// stand in a key or is that of a running planner, or metrics are asked for twice in a process.
 pub async fn start(config: Config) -> anyhow::Result<Planner> {
-    if let Some(listen) = config.metrics_listen {
-        metrics::serve(listen)?;
+    let session = &config.session;
+    let access = Access::new(session.tls()?.is_some(), config.tokens.as_deref())?;
+    if let Some(address) = config.metrics_listen {
+        let listen = session.listen_at(address, metrics::MAX_CONNECTIONS)?;
+        metrics::serve(listen, access.clone(), access::may_scrape).await?;
     }
     let core = PlannerCore::start(&config).await?;
-    let grpc = grpc::start(core.clone(), config.grpc_listen).await?;
+    let listen = session.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
+    let mut grpc = grpc::start(core.clone(), listen, access.clone()).await?;
     let openpi = match config.openpi_listen {
-        Some(listen) => Some(OpenpiServer::start(core.clone(), listen).await?),
+        Some(address) => {
+            let listen = session.listen_at(address, openpi::MAX_WAITING)?;
+            Some(OpenpiServer::start(core.clone(), listen, access).await?)
+        }
         None => None,
     };
     let zenoh = ZenohServer::start(core.clone(), &config).await?;
+    let connection = zenoh.connection(session);
+    grpc.follow(connection.connected());
     grpc.ready().await;
-    let planner = Planner { core, grpc, openpi, zenoh };
+    let planner = Planner { core, grpc, openpi, zenoh, connection };
     let (grpc, openpi) = (planner.grpc_address(), planner.openpi_address().map(tracing::field::display));
     info!(name = config.name, %grpc, openpi, "planner is ready");
     Ok(planner)
@@ -87,7 +100,8 @@ impl Planner {
     /// # Errors
     /// If gRPC had failed before, or zenoh does not close.
     pub async fn shutdown(self) -> anyhow::Result<()> {
-        let Self { core, mut grpc, openpi, mut zenoh } = self;
+        let Self { core, mut grpc, openpi, mut zenoh, connection } = self;
+        drop(connection);
         let drained = tokio::time::timeout(DRAIN_TIMEOUT, async {
             let openpi = async {
                 if let Some(openpi) = openpi {

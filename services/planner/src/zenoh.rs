@@ -5,6 +5,7 @@ use crate::core::PlannerCore;
 use crate::follow::Follower;
 use crate::task::{Answer, queue_full, too_late};
 use anyhow::{anyhow, ensure};
+use service_kit::session::{self, Connection, SessionConfig};
 use std::future::{Future, ready};
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio::runtime::Handle;
@@ -36,11 +37,12 @@ impl ZenohServer {
     /// Joins the others, declares the queryables, follows announcements and, with everything in place, says it is alive.
     ///
     /// # Errors
-    /// If the session cannot be opened, or the name cannot stand in a key.
+    /// If the session cannot be opened, or the name cannot stand in a key or is that of a running planner.
     pub(crate) async fn start(core: PlannerCore, config: &Config) -> anyhow::Result<Self> {
         let plan = key::planner_plan(&config.name)?;
         ensure!(!plan.is_wild(), "name: expected that of one planner, got {:?}", config.name);
-        let session = service_kit::session::open(&config.session).await?;
+        let session = session::open(&config.session).await?;
+        session::claim(&session, &config.session, &key::planner_alive(&config.name)?).await?;
         let capacity = config.queue_capacity.get();
         let requests = Requests {
             session: session.clone(),
@@ -85,6 +87,11 @@ impl ZenohServer {
         let alive = session.liveliness().declare_token(key::planner_alive(&config.name)?);
         let alive = Some(alive.await.map_err(|e| anyhow!(e))?);
         Ok(Self { session, alive, queryables, announcements, requests: requests.tasks })
+    }
+
+    /// The connection to the others.
+    pub(crate) fn connection(&self, config: &SessionConfig) -> Connection {
+        Connection::follow(&self.session, config)
     }
 
     /// Takes no more requests and waits for those in flight.

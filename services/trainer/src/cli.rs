@@ -84,6 +84,10 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     metrics_listen: Option<SocketAddr>,
+    /// File of the tokens that clients of gRPC and metrics may bear instead of a certificate [default: none].
+    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tokens: Option<PathBuf>,
     #[command(flatten)]
     session: SessionConfig,
 }

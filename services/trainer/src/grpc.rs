@@ -4,11 +4,13 @@ use crate::runs::Runs;
 use futures::StreamExt;
 use futures::stream::BoxStream;
 use service_kit::GrpcServer;
-use std::net::SocketAddr;
+use service_kit::access::Access;
+use service_kit::listener::ListenConfig;
 use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status};
 use tower::util::MapResponseLayer;
+use wire::access::may_call;
 use wire::grpc::{answer, name_unreadable_payload};
 use wire::proto::trainer_service_server::{TrainerService, TrainerServiceServer};
 use wire::training::{
@@ -20,12 +22,12 @@ use wire::{Code, Error, Message, proto};
 /// Listens and answers; healthy once it is told to be.
 ///
 /// # Errors
-/// If the address cannot be listened on.
-pub(crate) async fn start(runs: Runs, listen: SocketAddr) -> anyhow::Result<GrpcServer> {
+/// If the address cannot be listened on, or is beyond the loopback interface without TLS.
+pub(crate) async fn start(runs: Runs, listen: ListenConfig, access: Access) -> anyhow::Result<GrpcServer> {
     let service = TrainerServiceServer::new(Grpc(runs)).max_decoding_message_size(StartRunRequest::MAX_BYTES);
     let routes = Routes::new(service).into_axum_router().layer(MapResponseLayer::new(name_unreadable_payload));
     let name = TrainerServiceServer::<Grpc>::NAME;
-    GrpcServer::start(listen, name, proto::DESCRIPTORS, Routes::from(routes)).await
+    GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(routes)).await
 }
 
 /// The generated service, by the runs.

@@ -10,7 +10,9 @@ use crate::versions::Versions;
 use crate::{grpc, runs_metrics};
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
-use service_kit::{GrpcServer, SessionConfig, metrics};
+use service_kit::access::Access;
+use service_kit::session::Connection;
+use service_kit::{GrpcServer, SessionConfig, metrics, session};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::num::NonZeroU16;
 use std::path::PathBuf;
@@ -18,6 +20,8 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::task::JoinSet;
 use tracing::info;
+use wire::{access, key};
+use zenoh::liveliness::LivelinessToken;
 
 /// How long requests in flight may take to finish at shutdown.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
@@ -45,6 +49,8 @@ pub struct Config {
     /// What is started for a training run: this program, unless another embeds the service.
     #[serde(skip)]
     pub program: PathBuf,
+    /// File of the tokens that clients of gRPC and metrics may bear instead of a certificate.
+    pub tokens: Option<PathBuf>,
     /// How to join the others.
     pub session: SessionConfig,
 }
@@ -61,6 +67,7 @@ impl Default for Config {
             grpc_listen: (Ipv4Addr::LOCALHOST, 50052).into(),
             metrics_listen: None,
             program: std::env::current_exe().unwrap_or_else(|_| "cpn-trainer".into()),
+            tokens: None,
             session: SessionConfig::default(),
         }
     }
@@ -75,17 +82,22 @@ pub struct Service {
     runs_zenoh: RunsZenoh,
     grpc: GrpcServer,
     tasks: JoinSet<anyhow::Result<()>>,
+    connection: Connection,
+    alive: LivelinessToken,
 }
 
 /// Starts the service; when this returns, it answers.
 ///
 /// # Errors
 /// If the dataset is mixed or cannot be read, the published versions cannot be read, an address cannot be listened on, the
-/// session cannot be opened, or the name cannot stand in a key.
+/// session cannot be opened, or the name cannot stand in a key or is that of a running service.
 pub async fn start(config: Config) -> anyhow::Result<Service> {
-    let Config { name, dataset, checkpoints, keep_versions, runs, max_runs, program, .. } = config;
-    if let Some(listen) = config.metrics_listen {
-        metrics::serve(listen)?;
+    let Config { name, dataset, checkpoints, keep_versions, runs, max_runs, program, .. } = config.clone();
+    let network = &config.session;
+    let access = Access::new(network.tls()?.is_some(), config.tokens.as_deref())?;
+    if let Some(address) = config.metrics_listen {
+        let listen = network.listen_at(address, metrics::MAX_CONNECTIONS)?;
+        metrics::serve(listen, access.clone(), access::may_scrape).await?;
     }
     let of_runs = runs::Config {
         folder: runs,
@@ -99,20 +111,27 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
         anyhow::Ok((Arc::new(Recordings::open(dataset)?), Arc::new(versions), Runs::open(of_runs)?))
     };
     let (recordings, versions, runs) = tokio::task::spawn_blocking(open).await??;
-    let session = service_kit::session::open(&config.session).await?;
+    // Before the network is waited for, so that health tells of it.
+    let listen = network.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
+    let mut grpc = grpc::start(runs.clone(), listen, access).await?;
+    let token = key::trainer_alive(&name)?;
+    let session = session::open(network).await?;
+    session::claim(&session, network, &token).await?;
+    let connection = Connection::follow(&session, network);
+    grpc.follow(connection.connected());
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
     let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
     let runs_zenoh = runs_zenoh::start(&session, &name, &runs).await?;
-    let grpc = grpc::start(runs.clone(), config.grpc_listen).await?;
     let mut tasks = publish::start(&session, &versions).await?;
     let measured = runs.clone();
     tasks.spawn(async move {
         runs_metrics::follow(measured).await;
         Ok(())
     });
+    let alive = session.liveliness().declare_token(token).await.map_err(|e| anyhow!(e))?;
     grpc.ready().await;
     info!(name, grpc = %grpc.address, "trainer is ready");
-    Ok(Service { session, recorder, runs, runs_zenoh, grpc, tasks })
+    Ok(Service { session, recorder, runs, runs_zenoh, grpc, tasks, connection, alive })
 }
 
 impl Service {
@@ -143,7 +162,7 @@ impl Service {
     /// # Errors
     /// If gRPC had failed before, or the session does not close.
     pub async fn shutdown(mut self) -> anyhow::Result<()> {
-        drop(self.recorder);
+        drop((self.connection, self.alive, self.recorder));
         self.runs.shutdown().await;
         // Who watches a run has seen its end; a client that keeps asking does not keep the service.
         let drained = tokio::time::timeout(DRAIN_TIMEOUT, self.grpc.drain()).await;

@@ -87,6 +87,11 @@ def training_progress(run: str) -> str:
     return f"{ROOT}/training/{run}/progress"
 
 
+def trainer_alive(trainer: str) -> str:
+    """Liveliness token of a trainer's service that is ready."""
+    return f"{ROOT}/alive/trainer/{trainer}"
+
+
 def planner_alive(planner: str) -> str:
     """Liveliness token of a planner that is ready."""
     return f"{ROOT}/alive/planner/{planner}"

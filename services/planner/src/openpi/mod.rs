@@ -7,30 +7,34 @@ mod message;
 mod numpy;
 
 use crate::core::PlannerCore;
-use anyhow::Context;
 use futures::{SinkExt, StreamExt};
 pub use message::request;
+use service_kit::access::{Access, Refusal};
+use service_kit::listener::{Connection, ListenConfig, Listener};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::time::{sleep, timeout};
+use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::error::CapacityError;
 use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
 use tokio_tungstenite::tungstenite::http::StatusCode;
+use tokio_tungstenite::tungstenite::http::header::AUTHORIZATION;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Bytes, Error as SocketError, Message};
 use tokio_tungstenite::{WebSocketStream, accept_hdr_async_with_config};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
-use tracing::{debug, warn};
+use tracing::debug;
 use wire::Error;
+use wire::access::may_plan;
 
 /// Most clients at the same time; one more is refused.
 const MAX_CONNECTIONS: usize = 64;
+/// Most connections, with those that are only told so.
+pub(crate) const MAX_WAITING: usize = 2 * MAX_CONNECTIONS;
 /// Largest request.
 const MAX_BYTES: usize = 1 << 20;
 /// What a connection buffers, one way; a picture is 21 kB.
@@ -42,7 +46,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// How long a client may take to read why it is hung up on.
 const LINGER: Duration = Duration::from_secs(1);
 
-type Socket = WebSocketStream<TcpStream>;
+type Socket = WebSocketStream<Connection>;
 
 /// The planner's place among servers of openpi.
 #[derive(Debug)]
@@ -55,15 +59,15 @@ pub(crate) struct OpenpiServer {
 }
 
 impl OpenpiServer {
-    /// Listens and answers.
+    /// Listens, and answers those who have `access`.
     ///
     /// # Errors
-    /// If the address cannot be listened on.
-    pub(crate) async fn start(core: PlannerCore, listen: SocketAddr) -> anyhow::Result<Self> {
-        let listener = TcpListener::bind(listen).await.with_context(|| format!("openpi on {listen}"))?;
-        let address = listener.local_addr()?;
+    /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
+    pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Access) -> anyhow::Result<Self> {
+        let listener = Listener::bind("openpi", listen, &[b"http/1.1"]).await?;
+        let address = listener.address();
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
-        tasks.spawn(accept(listener, core, stop.clone(), tasks.clone()));
+        tasks.spawn(accept(listener, core, access, stop.clone(), tasks.clone()));
         Ok(Self { address, stop: stop.drop_guard(), tasks })
     }
 
@@ -75,36 +79,36 @@ impl OpenpiServer {
     }
 }
 
-async fn accept(listener: TcpListener, core: PlannerCore, stop: CancellationToken, tasks: TaskTracker) {
+async fn accept(
+    mut listener: Listener,
+    core: PlannerCore,
+    access: Access,
+    stop: CancellationToken,
+    tasks: TaskTracker,
+) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-    while let Some(accepted) = stop.run_until_cancelled(listener.accept()).await {
-        match accepted {
-            // Who comes when all places are taken is told so; of those, too, there may only be so many.
-            Ok((stream, client)) if tasks.len() <= 2 * MAX_CONNECTIONS => {
-                let (core, stop, place) = (core.clone(), stop.clone(), Arc::clone(&places).try_acquire_owned().ok());
-                tasks.spawn(async move {
-                    if let Err(error) = serve(stream, &core, place, &stop).await {
-                        debug!(%client, %error, "connection of an openpi client lost");
-                    }
-                });
+    while let Some(Some(stream)) = stop.run_until_cancelled(listener.next()).await {
+        // A client that comes when all places are taken is told so.
+        let (core, stop, place) = (core.clone(), stop.clone(), Arc::clone(&places).try_acquire_owned().ok());
+        let access = access.clone();
+        tasks.spawn(async move {
+            let client = stream.peer().address;
+            if let Err(error) = serve(stream, &core, &access, place, &stop).await {
+                debug!(%client, %error, "connection of an openpi client lost");
             }
-            Ok(_) => (),
-            Err(error) => {
-                warn!(%error, "no connection to an openpi client");
-                sleep(Duration::from_secs(1)).await;
-            }
-        }
+        });
     }
 }
 
 /// Serves a client until it leaves or the planner stops.
 async fn serve(
-    stream: TcpStream,
+    stream: Connection,
     core: &PlannerCore,
+    access: &Access,
     place: Option<OwnedSemaphorePermit>,
     stop: &CancellationToken,
 ) -> Result<(), SocketError> {
-    let mut socket = timeout(PATIENCE, shake_hands(stream, place.is_some())).await.map_err(too_slow)??;
+    let mut socket = timeout(PATIENCE, shake_hands(stream, access, place.is_some())).await.map_err(too_slow)??;
     send(&mut socket, Message::binary(message::metadata(core))).await?;
     let mut asked = false;
     while let Some(received) = stop.run_until_cancelled(timeout(SILENCE, socket.next())).await {
@@ -133,16 +137,20 @@ async fn serve(
 }
 
 #[expect(clippy::result_large_err, reason = "the library's signature")]
-async fn shake_hands(stream: TcpStream, has_place: bool) -> Result<Socket, SocketError> {
-    stream.set_nodelay(true)?;
-    let admit = |_: &Request, response: Response| {
-        if has_place {
-            return Ok(response);
+async fn shake_hands(stream: Connection, access: &Access, has_place: bool) -> Result<Socket, SocketError> {
+    let (peer, access) = (stream.peer().clone(), access.clone());
+    let admit = move |request: &Request, response: Response| {
+        let authorization = request.headers().get(AUTHORIZATION).and_then(|value| value.to_str().ok());
+        if let Err(refusal) = access.check(&peer, authorization, "openpi", may_plan) {
+            let forbidden = refusal == Refusal::Forbidden;
+            let status = if forbidden { StatusCode::FORBIDDEN } else { StatusCode::UNAUTHORIZED };
+            return Err(refused(status, &refusal.to_string()));
         }
-        let mut refused =
-            ErrorResponse::new(Some(format!("connections: expected a free place, got {MAX_CONNECTIONS}\n")));
-        *refused.status_mut() = StatusCode::SERVICE_UNAVAILABLE;
-        Err(refused)
+        if !has_place {
+            let reason = format!("connections: expected a free place, got {MAX_CONNECTIONS}");
+            return Err(refused(StatusCode::SERVICE_UNAVAILABLE, &reason));
+        }
+        Ok(response)
     };
     let config = WebSocketConfig::default()
         .read_buffer_size(BUFFER_BYTES)
@@ -150,6 +158,12 @@ async fn shake_hands(stream: TcpStream, has_place: bool) -> Result<Socket, Socke
         .max_message_size(Some(MAX_BYTES))
         .max_frame_size(Some(MAX_BYTES));
     accept_hdr_async_with_config(stream, admit, Some(config)).await
+}
+
+fn refused(status: StatusCode, reason: &str) -> ErrorResponse {
+    let mut response = ErrorResponse::new(Some(format!("{reason}\n")));
+    *response.status_mut() = status;
+    response
 }
 
 async fn answer(core: &PlannerCore, payload: &[u8]) -> Message {

@@ -1,0 +1,191 @@
+//! Access by role: one table of everything that is offered over the network, and of the roles that offer and use it.
+//!
+//! A router's access control, and the checks of gRPC, openpi and metrics, are made from it.
+
+use crate::{Error, key};
+use std::fmt;
+use std::str::FromStr;
+use zenoh::key_expr::OwnedKeyExpr;
+
+/// Role of a process or person in the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Role {
+    /// Answers plans.
+    Planner,
+    /// Keeps demonstrations, trains, publishes checkpoints.
+    Trainer,
+    /// Simulates.
+    Worker,
+    /// Closes the loop, and scores.
+    Evaluator,
+    /// Looks on.
+    Viewer,
+    /// Asks for plans.
+    Client,
+    /// Changes what is served and trained.
+    Operator,
+    /// Passes messages on.
+    Router,
+}
+
+use Role::{Client, Evaluator, Operator, Planner, Trainer, Viewer, Worker};
+
+impl Role {
+    /// Every role.
+    pub const ALL: [Self; 8] = [Planner, Trainer, Worker, Evaluator, Viewer, Client, Operator, Self::Router];
+
+    /// Its name in identities.
+    pub fn name(self) -> &'static str {
+        match self {
+            Planner => "planner",
+            Trainer => "trainer",
+            Worker => "worker",
+            Evaluator => "evaluator",
+            Viewer => "viewer",
+            Client => "client",
+            Operator => "operator",
+            Self::Router => "router",
+        }
+    }
+
+    /// The role of an identity, `ROLE` or `ROLE.NAME`: the common name of a certificate.
+    pub fn of(identity: &str) -> Option<Self> {
+        let role = identity.split_once('.').map_or(identity, |(role, _)| role);
+        role.parse().ok()
+    }
+}
+
+impl FromStr for Role {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self, Error> {
+        Self::ALL.into_iter().find(|role| role.name() == name).ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            Error::invalid("role", format!("one of {names}"), name)
+        })
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Way in which an endpoint is used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Some answer queries, others send them.
+    Query,
+    /// Some publish, others subscribe.
+    Publication,
+    /// Some hold a liveliness token, others watch it.
+    Liveliness,
+}
+
+/// Something that is offered over the network.
+#[derive(Debug, Clone, Copy)]
+pub struct Endpoint {
+    /// How it is used.
+    pub kind: Kind,
+    key: fn() -> Result<OwnedKeyExpr, Error>,
+    /// Roles that answer, publish or hold the token.
+    pub offered_by: &'static [Role],
+    /// Roles that ask, subscribe or watch.
+    pub used_by: &'static [Role],
+    /// Path of the same over gRPC.
+    pub grpc: Option<&'static str>,
+}
+
+impl Endpoint {
+    /// Every key that it is at.
+    ///
+    /// # Errors
+    /// Never: every chunk may be `*`.
+    pub fn key(&self) -> Result<OwnedKeyExpr, Error> {
+        (self.key)()
+    }
+}
+
+/// Roles that may ask a planner for plans.
+const PLANS: &[Role] = &[Evaluator, Client, Operator];
+
+/// Everything that is offered. What is not here is denied.
+pub const ENDPOINTS: &[Endpoint] = &[
+    query(|| key::planner_plan("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/Plan"),
+    query(|| key::planner_register_goal("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/RegisterGoal"),
+    query(
+        || key::planner_list_models("*"),
+        &[Planner],
+        &[Evaluator, Client, Operator, Viewer],
+        "/cpn.v1.PlannerService/ListModels",
+    ),
+    query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel"),
+    zenoh(Kind::Query, || key::sim_reset("*"), &[Worker], &[Evaluator]),
+    zenoh(Kind::Query, || key::sim_step("*"), &[Worker], &[Evaluator]),
+    zenoh(Kind::Publication, || key::sim_frame("*"), &[Worker], &[Viewer]),
+    zenoh(Kind::Publication, || key::sim_action("*"), &[Worker], &[Viewer]),
+    // A trainer may send its recordings to another one, as a worker does.
+    zenoh(Kind::Publication, || key::demonstration_step("*", "*"), &[Worker, Trainer], &[Trainer]),
+    zenoh(Kind::Query, || key::demonstration_step("*", "*"), &[Trainer], &[Trainer, Viewer]),
+    zenoh(Kind::Query, || key::demonstration_commit("*"), &[Trainer], &[Worker, Trainer]),
+    zenoh(Kind::Publication, || key::demonstration_recorded("*"), &[Trainer], &[Trainer, Viewer]),
+    zenoh(Kind::Query, || key::demonstration_recorded("*"), &[Trainer], &[Worker, Trainer, Viewer]),
+    zenoh(Kind::Publication, || key::checkpoint_announcement("*"), &[Trainer], &[Planner, Viewer]),
+    zenoh(Kind::Query, || key::checkpoint_chunk("*"), &[Trainer], &[Planner, Operator]),
+    zenoh(Kind::Query, || key::checkpoint_list_versions("*"), &[Trainer], &[Operator, Viewer]),
+    zenoh(Kind::Query, || key::checkpoint_promote("*"), &[Trainer], &[Operator]),
+    zenoh(Kind::Query, || key::checkpoint_roll_back("*"), &[Trainer], &[Operator]),
+    query(|| key::trainer_start_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StartRun"),
+    query(|| key::trainer_stop_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StopRun"),
+    query(|| key::trainer_list_runs("*"), &[Trainer], &[Operator, Viewer], "/cpn.v1.TrainerService/ListRuns"),
+    Endpoint {
+        grpc: Some("/cpn.v1.TrainerService/WatchRun"),
+        ..zenoh(Kind::Publication, || key::training_progress("*"), &[Trainer], &[Operator, Viewer])
+    },
+    zenoh(
+        Kind::Liveliness,
+        || key::planner_alive("*"),
+        &[Planner],
+        &[Planner, Trainer, Evaluator, Viewer, Client, Operator],
+    ),
+    zenoh(Kind::Liveliness, || key::sim_alive("*"), &[Worker], &[Worker, Evaluator, Viewer, Operator]),
+    zenoh(Kind::Liveliness, || key::trainer_alive("*"), &[Trainer], &[Trainer, Worker, Viewer, Operator]),
+];
+
+/// Roles that may read metrics.
+const METRICS: &[Role] = &[Viewer, Operator];
+
+const fn zenoh(
+    kind: Kind,
+    key: fn() -> Result<OwnedKeyExpr, Error>,
+    offered_by: &'static [Role],
+    used_by: &'static [Role],
+) -> Endpoint {
+    Endpoint { kind, key, offered_by, used_by, grpc: None }
+}
+
+const fn query(
+    key: fn() -> Result<OwnedKeyExpr, Error>,
+    offered_by: &'static [Role],
+    used_by: &'static [Role],
+    grpc: &'static str,
+) -> Endpoint {
+    Endpoint { kind: Kind::Query, key, offered_by, used_by, grpc: Some(grpc) }
+}
+
+/// Whether an identity may call a method of gRPC, by its path.
+pub fn may_call(identity: &str, path: &str) -> bool {
+    let endpoint = ENDPOINTS.iter().find(|endpoint| endpoint.grpc == Some(path));
+    endpoint.zip(Role::of(identity)).is_some_and(|(endpoint, role)| endpoint.used_by.contains(&role))
+}
+
+/// Whether an identity may ask for plans.
+pub fn may_plan(identity: &str) -> bool {
+    Role::of(identity).is_some_and(|role| PLANS.contains(&role))
+}
+
+/// Whether an identity may read metrics.
+pub fn may_scrape(identity: &str) -> bool {
+    Role::of(identity).is_some_and(|role| METRICS.contains(&role))
+}
