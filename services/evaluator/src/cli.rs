@@ -28,9 +28,9 @@ pub enum Command {
 /// Arguments of `run`.
 #[derive(Debug, Clone, Args)]
 pub struct RunArgs {
-    /// Name of the planner to ask.
-    #[arg(long, default_value = "planner")]
-    pub planner: String,
+    /// Names of the planners, all with the same checkpoints; trials are spread over those that are alive.
+    #[arg(long, value_delimiter = ',', default_value = "planner")]
+    pub planner: Vec<String>,
     /// Simulator workers to wait for; all that are alive are used.
     #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
     pub workers: u32,
@@ -58,13 +58,16 @@ pub struct RunArgs {
     /// Print the summary as JSON instead of a table.
     #[arg(long)]
     pub json: bool,
-    /// How long a planner or worker may take for an answer.
+    /// Limit of an answer by a planner or worker.
     #[arg(long, default_value_t = 10, value_parser = value_parser!(u64).range(1..=3600))]
     pub timeout_secs: u64,
-    /// How long to wait for the planner and the workers, at the start and whenever none is left.
+    /// Time in which a lost router, planner or worker may come back for a trial to go on; after it the trial begins anew.
+    #[arg(long, default_value_t = 30, value_parser = value_parser!(u64).range(..=3600))]
+    pub recovery_secs: u64,
+    /// Limit of the wait for router, planners and workers, at the start and whenever no planner or no worker is left.
     #[arg(long, default_value_t = 60, value_parser = value_parser!(u64).range(1..=86_400))]
     pub wait_secs: u64,
-    /// How to join the planner and the workers.
+    /// Connection to the planners and the workers.
     #[command(flatten)]
     pub session: SessionConfig,
 }

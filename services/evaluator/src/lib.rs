@@ -1,13 +1,17 @@
-//! Measures first-attempt success: closes the loop between simulator workers and the planner, records every trial, and
+//! Measures first-attempt success: closes the loop between simulator workers and planners, records every trial, and
 //! reports rates with their confidence intervals.
 //!
-//! Every model is run on the same variations (`queue`), one trial at a time on each worker (`schedule`, `trial`). The
-//! records (`record`, `filmstrip`) are all that the report (`summary`, `table`, `report`) is made from, so that a run
-//! can be interrupted and gone on with. What the planner was asked in an episode can be asked again (`replay`).
+//! Every model is run on the same variations (`queue`), one trial at a time on each worker (`schedule`, `trial`), spread
+//! over the planners (`planners`). Outages of routers and services are waited for (`link`, `presence`), or the trial begins
+//! anew from its seed, so that the results are the same as without. The records (`record`, `filmstrip`) are all that the
+//! report (`summary`, `table`, `report`) is made from, so that a run can be interrupted and gone on with. What a planner
+//! was asked in an episode can be asked again (`replay`).
 
 mod chart;
 mod cli;
 mod filmstrip;
+mod link;
+mod planners;
 mod presence;
 mod progress;
 mod queue;
@@ -26,39 +30,42 @@ pub use summary::{Row, Summary, Training};
 pub use table::table;
 
 use anyhow::{Context, bail, ensure};
-use backon::{ConstantBuilder, Retryable};
+use link::Link;
+use service_kit::session::Connection;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
-use wire::planner::{ListModelsRequest, ListModelsResponse};
-use wire::{Code, Message, key, query};
+use std::time::{Duration, Instant, SystemTime};
+use wire::key;
+use wire::planner::{ListModelsRequest, ListModelsResponse, ModelInfo};
 use zenoh::Session;
-use zenoh::key_expr::OwnedKeyExpr;
 
 /// Runs what is missing of an evaluation, and reports.
 ///
 /// # Errors
-/// If planner and workers do not come up, a model or task is unknown, the folder cannot be used, or the user
+/// If router, planners and workers do not come up, the planners differ, a model or task is unknown, the folder cannot be used, or the user
 /// interrupts. A trial that fails for reasons of its own is no error here: the summary counts it.
 pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
-    for (option, names) in [("--models", &args.models), ("--tasks", &args.tasks)] {
+    for (option, names) in [("--planner", &args.planner), ("--models", &args.models), ("--tasks", &args.tasks)] {
         let distinct: BTreeSet<_> = names.iter().collect();
         ensure!(distinct.len() == names.len(), "{option}: expected every name once, got {}", names.join(","));
     }
     let patience = Duration::from_secs(args.wait_secs);
     let timeout = Duration::from_secs(args.timeout_secs);
-    let session = service_kit::session::open(&args.session).await?;
+    let start = Instant::now();
+    let session = link::join(&args.session, patience).await?;
+    let _connection = Connection::follow(&session, &args.session);
     let mut alive = presence::follow(&session, &args.planner).await?;
-    presence::wait(&mut alive, &args.planner, args.workers, patience).await?;
+    let left = patience.saturating_sub(start.elapsed());
+    presence::wait(&session, &mut alive, &args.planner, args.workers, left).await?;
 
     let run = Run {
         format: FORMAT,
         title: args.title.clone(),
         command: command_line(),
         date: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
-        planner: args.planner.clone(),
-        models: models(&session, &args.planner, &args.models, timeout).await?,
+        planners: args.planner.clone(),
+        models: models(&session, &args.planner, &args.models, timeout, patience).await?,
         tasks: args.tasks.clone(),
         trials: args.trials,
         first_seed: args.first_seed,
@@ -67,8 +74,9 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     let folder = Folder::new(&args.out);
     folder.check_goal(args.goal)?;
     folder.write_run(&run)?;
-    let link = trial::Link { session: session.clone(), planner: args.planner.clone(), timeout };
-    schedule::Schedule::new(Arc::new(run), folder, link)?.drive(alive, patience).await?;
+    let recovery = Duration::from_secs(args.recovery_secs);
+    let link = Link { session: session.clone(), timeout, recovery, alive };
+    schedule::Schedule::new(Arc::new(run), folder, link)?.drive(patience).await?;
     // What is reported is in the folder by now.
     if let Err(error) = session.close().await {
         tracing::warn!("closing the zenoh session: {error}");
@@ -92,37 +100,63 @@ pub fn report(out: &Path) -> anyhow::Result<Summary> {
     Ok(summary)
 }
 
-/// The named models as the planner serves them, or all of them if none is named.
-async fn models(session: &Session, planner: &str, names: &[String], timeout: Duration) -> anyhow::Result<Vec<Model>> {
-    let key = key::planner_list_models(planner)?;
-    let response: ListModelsResponse = ask(session, &key, ListModelsRequest, timeout)
-        .await
-        .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
-    let served = response.models;
-    let known = || served.iter().map(|model| model.name.as_str()).collect::<Vec<_>>().join(", ");
-    if served.is_empty() {
-        bail!("planner \"{planner}\" serves no model");
+/// The named models, or all of the first planner if none is named, as every planner serves them.
+async fn models(
+    session: &Session,
+    planners: &[String],
+    names: &[String],
+    timeout: Duration,
+    patience: Duration,
+) -> anyhow::Result<Vec<Model>> {
+    let mut models: Option<(&String, Vec<Model>)> = None;
+    for planner in planners {
+        let key = key::planner_list_models(planner)?;
+        // Right after connecting, the services of a planner that is alive may not be known yet.
+        let response: ListModelsResponse = link::ask(session, &key, ListModelsRequest, timeout, patience)
+            .await
+            .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
+        match &models {
+            None => models = Some((planner, selected(planner, response.models, names)?)),
+            Some((first, expected)) => check_same(first, expected, planner, &response.models)?,
+        }
     }
+    Ok(models.map(|(_, models)| models).unwrap_or_default())
+}
+
+/// The named models, or all if none is named.
+fn selected(planner: &str, served: Vec<ModelInfo>, names: &[String]) -> anyhow::Result<Vec<Model>> {
+    ensure!(!served.is_empty(), "planner \"{planner}\" serves no model");
     if names.is_empty() {
         return Ok(served.into_iter().map(Model::from).collect());
     }
     let find = |name: &String| {
         let model = served.iter().find(|model| model.name == *name).cloned().map(Model::from);
-        model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", known()))
+        model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", listed(&served)))
     };
     names.iter().map(find).collect()
 }
 
-/// Asks a planner that has only just been found: right after connecting, its services may not be known yet.
-async fn ask<Q: Message + Clone, R: Message>(
-    session: &Session,
-    key: &OwnedKeyExpr,
-    request: Q,
-    timeout: Duration,
-) -> Result<R, wire::Error> {
-    let again = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(10);
-    let call = || query::call(session, key, request.clone(), timeout);
-    call.retry(again).when(|error: &wire::Error| error.code == Code::Unavailable).await
+/// Checks that a planner serves the models as the first one does.
+fn check_same(first: &str, expected: &[Model], planner: &str, served: &[ModelInfo]) -> anyhow::Result<()> {
+    for Model { name, digest, .. } in expected {
+        let Some(got) = served.iter().find(|model| model.name == *name) else {
+            bail!(
+                "--planner: expected planner \"{planner}\" to serve {name} as planner \"{first}\" does, got {}",
+                listed(served)
+            );
+        };
+        ensure!(
+            got.digest == *digest,
+            "--planner: expected planner \"{planner}\" to serve {name} from checkpoint {digest} as planner \"{first}\" does, \
+             got {}",
+            got.digest
+        );
+    }
+    Ok(())
+}
+
+fn listed(served: &[ModelInfo]) -> String {
+    served.iter().map(|model| model.name.as_str()).collect::<Vec<_>>().join(", ")
 }
 
 /// What was typed, fit to be typed again.

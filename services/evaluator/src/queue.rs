@@ -4,14 +4,28 @@ use crate::record::Run;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use wire::sim::Variation;
 
+/// Outages after which a trial may begin anew.
+pub(crate) const MAX_OUTAGES: u32 = 5;
+/// Faults of services after which a trial may begin anew.
+pub(crate) const MAX_FAULTS: u32 = 1;
+
 /// A trial to run.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Job {
     pub(crate) variation: Variation,
     /// Index of the model.
     pub(crate) model: usize,
-    /// Whether it has failed before for reasons of its own.
-    pub(crate) again: bool,
+    /// Outages that ended it before.
+    pub(crate) outages: u32,
+    /// Faults of services that ended it before.
+    pub(crate) faults: u32,
+}
+
+impl Job {
+    /// Whether it may begin anew after all that ended it before.
+    pub(crate) fn may_begin_anew(&self) -> bool {
+        self.outages <= MAX_OUTAGES && self.faults <= MAX_FAULTS
+    }
 }
 
 /// Trials by task, so that a worker changes its task rarely.
@@ -68,12 +82,12 @@ impl Queue {
         self.tasks[task].jobs.pop_front()
     }
 
-    /// Takes back a trial that is to be tried once more, after the others of its task.
+    /// Takes back a trial that is to begin anew, after the others of its task.
     pub(crate) fn retry(&mut self, job: Job) {
         if let Some(task) = self.tasks.iter_mut().find(|task| task.name == job.variation.task)
             && !task.skipped.contains(&job.variation.seed)
         {
-            task.jobs.push_back(Job { again: true, ..job });
+            task.jobs.push_back(job);
         }
     }
 
@@ -106,7 +120,7 @@ impl Queue {
         task.next_seed += 1;
         for model in 0..self.models {
             if !self.finished.contains(&(variation.clone(), model)) {
-                task.jobs.push_back(Job { variation: variation.clone(), model, again: false });
+                task.jobs.push_back(Job { variation: variation.clone(), model, outages: 0, faults: 0 });
             }
         }
     }
@@ -135,7 +149,7 @@ mod tests {
             title: String::new(),
             command: String::new(),
             date: String::new(),
-            planner: "planner".into(),
+            planners: vec!["planner".into()],
             models: vec![model("cpn"), model("random")],
             tasks: tasks.iter().map(ToString::to_string).collect(),
             trials,
@@ -207,6 +221,14 @@ mod tests {
         let first = queue.next(None).unwrap();
         queue.retry(first.clone());
         assert_eq!(queue.next(None).unwrap().model, 1);
-        assert_eq!(queue.next(None).unwrap(), Job { again: true, ..first });
+        assert_eq!(queue.next(None).unwrap(), first);
+    }
+
+    #[test]
+    fn a_trial_begins_anew_after_five_outages_and_one_fault() {
+        let job = queue(&["reach"], 1, &[]).next(None).unwrap();
+        let may = |outages, faults| Job { outages, faults, ..job.clone() }.may_begin_anew();
+        assert!(may(5, 0) && may(0, 1) && may(5, 1));
+        assert!(!may(6, 0) && !may(0, 2));
     }
 }

@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use recording::plans::{self, Plans};
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use service_kit::files::write_atomically;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -25,8 +25,9 @@ pub struct Run {
     pub command: String,
     /// When it was started, RFC 3339.
     pub date: String,
-    /// Name of the planner.
-    pub planner: String,
+    /// Names of the planners; runs of a single planner were once recorded as `planner`.
+    #[serde(alias = "planner", deserialize_with = "one_or_many")]
+    pub planners: Vec<String>,
     /// The compared models, in the order of the command line.
     pub models: Vec<Model>,
     /// The tasks, in the order of the command line.
@@ -37,6 +38,20 @@ pub struct Run {
     pub first_seed: u64,
     /// Where the goals come from.
     pub goal: GoalSource,
+}
+
+/// A list, or a single name in place of one.
+fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Names {
+        One(String),
+        Many(Vec<String>),
+    }
+    Ok(match Names::deserialize(deserializer)? {
+        Names::One(name) => vec![name],
+        Names::Many(names) => names,
+    })
 }
 
 /// Which variation's end the goal shows.

@@ -1,16 +1,18 @@
 //! A recorded episode, played back through a planner: the same requests must get the same answers, bit for bit.
 
 use crate::cli::ReplayArgs;
-use crate::presence;
+use crate::{link, presence};
 use anyhow::Context;
 use recording::plans::{self, Exchange};
 use std::fmt;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use wire::planner::{Goal, PlanRequest, PlanResponse, Search};
 use wire::{Observation, key};
 
 /// How long to wait for the planner.
 const WAIT: Duration = Duration::from_secs(10);
+/// How long a router or the planner may be away.
+const RECOVERY: Duration = Duration::from_secs(30);
 /// Longer than any plan takes, on a slow machine too.
 const PATIENCE: Duration = Duration::from_secs(600);
 
@@ -54,16 +56,19 @@ impl fmt::Display for Replay {
 /// without the checkpoint.
 pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     let recorded = plans::read(&args.file).with_context(|| args.file.display().to_string())?;
-    let session = service_kit::session::open(&args.session).await?;
-    let mut alive = presence::follow(&session, &args.planner).await?;
-    presence::wait(&mut alive, &args.planner, 0, WAIT).await?;
+    let start = Instant::now();
+    let session = link::join(&args.session, WAIT).await?;
+    let planners = [args.planner.clone()];
+    let mut alive = presence::follow(&session, &planners).await?;
+    presence::wait(&session, &mut alive, &planners, 0, WAIT.saturating_sub(start.elapsed())).await?;
 
     let key = key::planner_plan(&args.planner)?;
     let exchanges = recorded.exchanges();
     let mut difference = None;
     for (step, exchange) in exchanges.iter().enumerate() {
         let request = again(&recorded.episode().goal, exchange);
-        let now = crate::ask(&session, &key, request, PATIENCE).await.with_context(|| format!("step {step}"))?;
+        let now = link::ask(&session, &key, request, PATIENCE, RECOVERY);
+        let now = now.await.with_context(|| format!("step {step}"))?;
         difference = compare(step, exchange, now);
         if difference.is_some() {
             break;

@@ -1,20 +1,22 @@
 //! Hands trials to the workers that are alive, one at a time each.
 
 use crate::filmstrip;
-use crate::presence::Alive;
+use crate::link::Link;
+use crate::planners::Planners;
+use crate::presence::{Alive, Service};
 use crate::progress::Progress;
-use crate::queue::{Job, Queue};
+use crate::queue::{Job, MAX_FAULTS, MAX_OUTAGES, Queue};
 use crate::record::{FORMAT, Folder, Outcome, Run, Trial};
-use crate::trial::{self, Attempt, Fault, Link};
+use crate::trial::{self, Attempt, Fault, Services};
 use anyhow::{Context, bail};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::watch;
 use tokio::task::JoinSet;
+use wire::Error;
 use wire::sim::Variation;
 
-/// Pause of a worker after a fault: long enough for liveliness to tell whether the worker or the planner is gone.
+/// Pause of a worker after a fault: long enough for liveliness to tell whether it or the planner is gone.
 const PAUSE: Duration = Duration::from_secs(1);
 
 /// An evaluation under way.
@@ -24,6 +26,7 @@ pub(crate) struct Schedule {
     folder: Folder,
     link: Link,
     queue: Queue,
+    planners: Planners,
     /// Workers with a trial under way.
     busy: BTreeSet<String>,
     /// The task each worker is at.
@@ -35,7 +38,7 @@ pub(crate) struct Schedule {
 /// What became of a trial.
 #[derive(Debug)]
 struct Finished {
-    worker: String,
+    services: Services,
     job: Job,
     result: Result<Attempt, Fault>,
 }
@@ -56,14 +59,15 @@ impl Schedule {
         let total = run.tasks.len() * run.models.len() * run.trials as usize;
         let progress = Progress::new(total, queue.len(), run.models.iter().map(|model| model.name.clone()));
         let (busy, at, running) = (BTreeSet::new(), BTreeMap::new(), JoinSet::new());
-        Ok(Self { run, folder, link, queue, busy, at, running, progress })
+        Ok(Self { run, folder, link, queue, planners: Planners::default(), busy, at, running, progress })
     }
 
     /// Runs every trial. Without planner or worker it waits for `patience`, then records what is left as errors.
     ///
     /// # Errors
     /// If a request is refused as wrong, a record cannot be written, or the user interrupts.
-    pub(crate) async fn drive(mut self, mut alive: watch::Receiver<Alive>, patience: Duration) -> anyhow::Result<()> {
+    pub(crate) async fn drive(mut self, patience: Duration) -> anyhow::Result<()> {
+        let mut alive = self.link.alive.clone();
         let interrupted = service_kit::shutdown::requested();
         tokio::pin!(interrupted);
         loop {
@@ -90,27 +94,37 @@ impl Schedule {
 
     /// Gives each idle worker a trial, as long as there is somebody to plan.
     fn assign(&mut self, alive: &Alive) {
-        if !alive.planner {
-            return;
-        }
         for worker in alive.workers.difference(&self.busy.clone()) {
+            if self.queue.len() == 0 {
+                return;
+            }
+            let Some(planner) = self.planners.assign(&alive.planners) else { return };
             let Some(job) = self.queue.next(self.at.get(worker).map(String::as_str)) else { return };
             self.busy.insert(worker.clone());
             self.at.insert(worker.clone(), job.variation.task.clone());
-            let (run, link, worker) = (self.run.clone(), self.link.clone(), worker.clone());
+            let (run, link) = (self.run.clone(), self.link.clone());
+            let services = Services { planner, worker: worker.clone() };
             self.running.spawn(async move {
                 let model = &run.models[job.model];
-                let result = trial::attempt(&link, &worker, model, &job.variation, run.goal).await;
-                if matches!(result, Err(Fault::Broken(_))) {
+                let result = trial::attempt(&link, &services, model, &job.variation, run.goal).await;
+                if matches!(result, Err(Fault::Outage { .. } | Fault::Broken { .. })) {
                     tokio::time::sleep(PAUSE).await;
                 }
-                Finished { worker, job, result }
+                Finished { services, job, result }
             });
         }
     }
 
-    fn finish(&mut self, Finished { worker, job, result }: Finished) -> anyhow::Result<()> {
+    fn finish(&mut self, Finished { services, job, result }: Finished) -> anyhow::Result<()> {
+        let Services { planner, worker } = services;
         self.busy.remove(&worker);
+        self.planners.release(&planner);
+        match &result {
+            Ok(_) => self.planners.clear(&planner),
+            Err(Fault::Outage { by, .. } | Fault::Broken { by, .. }) => self.planners.suspect(by),
+            Err(Fault::NoGoalImage | Fault::Refused(_)) => (),
+        }
+
         let model = &self.run.models[job.model].name;
         let Variation { task, seed } = &job.variation;
         match result {
@@ -128,18 +142,30 @@ impl Schedule {
                 self.folder.skip(task, *seed)?;
             }
             Err(Fault::Refused(error)) => bail!("{task} {seed}, {model}, worker {worker}: refused: {error}"),
-            Err(Fault::Broken(error)) => {
-                let message = format!("worker {worker}: {error}");
-                if job.again {
-                    self.progress.say(|| tracing::error!("{task} {seed}, {model}: {message}"));
-                    self.record(&job, Outcome::Error { message }, None)?;
-                } else {
-                    self.progress.say(|| tracing::warn!("{task} {seed}, {model}: {message}; will be tried once more"));
-                    self.queue.retry(job);
-                }
-            }
+            Err(Fault::Outage { by, error }) => self.again(Job { outages: job.outages + 1, ..job }, &by, &error)?,
+            Err(Fault::Broken { by, error }) => self.again(Job { faults: job.faults + 1, ..job }, &by, &error)?,
         }
         self.progress.left(self.left());
+        Ok(())
+    }
+
+    /// Lets a trial that did not come to its end begin anew, or records that it never did.
+    fn again(&mut self, job: Job, by: &Service, error: &Error) -> anyhow::Result<()> {
+        let model = &self.run.models[job.model].name;
+        let (Variation { task, seed }, Job { outages, faults, .. }) = (&job.variation, &job);
+        if job.may_begin_anew() {
+            self.progress.say(|| {
+                tracing::warn!(
+                    "{task} {seed}, {model}: {by}: {error}; begins anew after {outages} of {MAX_OUTAGES} outages and {faults} \
+                     of {MAX_FAULTS} faults"
+                );
+            });
+            self.queue.retry(job);
+        } else {
+            let message = format!("{by}: {error}");
+            self.progress.say(|| tracing::error!("{task} {seed}, {model}: {message}"));
+            self.record(&job, Outcome::Error { message }, None)?;
+        }
         Ok(())
     }
 

@@ -1,26 +1,25 @@
 //! One first attempt: closes the loop between a simulator worker and the planner.
 
+use crate::link::{Link, is_outage};
+use crate::presence::Service;
 use crate::record::{self, GoalSource, Model, Outcome, StageTimes};
 use recording::plans::{Exchange, Plans};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
 use wire::replay::PlannedEpisode;
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
-use wire::{Code, Error, Image, Message, Observation, key, query};
-use zenoh::Session;
-use zenoh::key_expr::OwnedKeyExpr;
+use wire::{Code, Error, Image, Observation, key};
 
 /// Variations that are tried for the goal of an ablation.
 const GOAL_TRIES: u32 = 10;
 
-/// How to reach the planner and the workers.
-#[derive(Debug, Clone)]
-pub(crate) struct Link {
-    pub(crate) session: Session,
+/// The services that a trial is run with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Services {
     /// Name of the planner.
     pub(crate) planner: String,
-    /// How long an answer may take.
-    pub(crate) timeout: Duration,
+    /// Name of the worker.
+    pub(crate) worker: String,
 }
 
 /// An attempt that came to its end.
@@ -43,18 +42,35 @@ pub(crate) enum Fault {
     NoGoalImage,
     /// A request that is wrong and will stay wrong.
     Refused(Error),
-    /// Another attempt may fare better.
-    Broken(Error),
+    /// A router or a service was away for too long, or is another one since. A trial that begins anew will fare better.
+    Outage {
+        /// The service that did not answer, or not as before.
+        by: Service,
+        /// The error.
+        error: Error,
+    },
+    /// A fault of a service. Another attempt may fare better.
+    Broken {
+        /// The service.
+        by: Service,
+        /// The error.
+        error: Error,
+    },
 }
 
-impl From<Error> for Fault {
-    fn from(error: Error) -> Self {
+impl Fault {
+    fn new(by: Service, error: Error) -> Self {
         match (error.code, error.field.as_str()) {
             (Code::FailedPrecondition, "variation.seed" | "goal_seed") => Self::NoGoalImage,
             // A worker without the task's simulator; pictures of two renderings.
             (Code::FailedPrecondition, "variation.task" | "goal_id" | "observation.render_spec")
             | (Code::InvalidArgument, _) => Self::Refused(error),
-            _ => Self::Broken(error),
+            _ if is_outage(&error) => Self::Outage { by, error },
+            // A worker or a planner that was started anew: without the episode, or with other checkpoints.
+            (Code::NotFound, "episode_id" | "goal_id" | "model") | (Code::FailedPrecondition, "model_digest") => {
+                Self::Outage { by, error }
+            }
+            _ => Self::Broken { by, error },
         }
     }
 }
@@ -63,18 +79,21 @@ impl From<Error> for Fault {
 /// position, the model is told that and where the hand is, and no picture.
 pub(crate) async fn attempt(
     link: &Link,
-    worker: &str,
+    Services { planner, worker }: &Services,
     model: &Model,
     variation: &Variation,
     goal: GoalSource,
 ) -> Result<Attempt, Fault> {
-    let reset = link.reset(worker, variation, goal).await?;
+    let (planner, worker) = (Service::Planner(planner.clone()), Service::Worker(worker.clone()));
+    let by_planner = |error| Fault::new(planner.clone(), error);
+    let by_worker = |error| Fault::new(worker.clone(), error);
+    let reset = link.reset(&worker, variation, goal).await.map_err(by_worker)?;
     let start = Instant::now();
     let goal = match reset.goal_position {
         Some(position) => Goal::Position(position),
-        None => Goal::Id(link.register_goal(&reset.goal).await?),
+        None => Goal::Id(link.register_goal(&planner, &reset.goal).await.map_err(by_planner)?),
     };
-    let step_key = key::sim_step(worker)?;
+    let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
     let mut exchanges = Vec::new();
     let mut hand = reset.hand_position;
     let mut frames = vec![reset.observation];
@@ -91,17 +110,17 @@ pub(crate) async fn attempt(
             )
         };
         let asked = start.elapsed();
-        let mut plan = link.plan(request.clone()).await;
+        let mut plan = link.plan(&planner, request.clone()).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
             // The planner was restarted, or has evicted the goal.
-            link.register_goal(&reset.goal).await?;
-            plan = link.plan(request.clone()).await;
+            link.register_goal(&planner, &reset.goal).await.map_err(by_planner)?;
+            plan = link.plan(&planner, request.clone()).await;
         }
-        let response = plan?;
+        let response = plan.map_err(by_planner)?;
         let action = response.first_action.clone();
         exchanges.push(Exchange { request, asked, response, answered: start.elapsed() });
         let request = StepRequest { episode_id: reset.episode_id.clone(), step, action };
-        let response: StepResponse = link.call(step_key.clone(), request).await?;
+        let response: StepResponse = link.call(&worker, step_key.clone(), request).await.map_err(by_worker)?;
         hand = response.hand_position;
         frames.push(response.observation);
         if response.done {
@@ -113,12 +132,12 @@ pub(crate) async fn attempt(
                 goal: reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from),
                 plans: step + 1,
             };
-            let plans = Plans::new(episode, exchanges)?;
+            let plans = Plans::new(episode, exchanges).map_err(by_planner)?;
             return Ok(Attempt { outcome, episode: course(&plans), goal: reset.goal, frames, plans });
         }
     }
     let expected = format!("true after {} steps", reset.max_steps);
-    Err(Fault::Broken(Error::new(Code::Internal, "done", expected, false)))
+    Err(by_worker(Error::new(Code::Internal, "done", expected, false)))
 }
 
 /// Seed of the plan before a step: no two steps of an evaluation share one.
@@ -127,11 +146,7 @@ fn plan_seed(variation: u64, step: u32) -> u64 {
 }
 
 impl Link {
-    async fn call<Q: Message, R: Message>(&self, key: OwnedKeyExpr, request: Q) -> Result<R, Error> {
-        query::call(&self.session, &key, request, self.timeout).await
-    }
-
-    async fn reset(&self, worker: &str, variation: &Variation, goal: GoalSource) -> Result<ResetResponse, Error> {
+    async fn reset(&self, worker: &Service, variation: &Variation, goal: GoalSource) -> Result<ResetResponse, Error> {
         let mut goal_seed = match goal {
             GoalSource::SameVariation => None,
             GoalSource::OtherVariation => Some(variation.seed + 1),
@@ -140,7 +155,7 @@ impl Link {
         loop {
             left -= 1;
             let request = ResetRequest { variation: variation.clone(), goal_seed };
-            match self.call(key::sim_reset(worker)?, request).await {
+            match self.call(worker, key::sim_reset(worker.name())?, request).await {
                 // The expert does not solve the other variation: the next one will do as well.
                 Err(error) if error.field == "goal_seed" && left > 0 => goal_seed = goal_seed.map(|seed| seed + 1),
                 answer => return answer,
@@ -148,13 +163,14 @@ impl Link {
         }
     }
 
-    async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
-        self.call(key::planner_plan(&self.planner)?, request).await
+    async fn plan(&self, planner: &Service, request: PlanRequest) -> Result<PlanResponse, Error> {
+        self.call(planner, key::planner_plan(planner.name())?, request).await
     }
 
-    async fn register_goal(&self, goal: &Image) -> Result<String, Error> {
+    async fn register_goal(&self, planner: &Service, goal: &Image) -> Result<String, Error> {
         let request = RegisterGoalRequest { image: goal.clone() };
-        let response: RegisterGoalResponse = self.call(key::planner_register_goal(&self.planner)?, request).await?;
+        let key = key::planner_register_goal(planner.name())?;
+        let response: RegisterGoalResponse = self.call(planner, key, request).await?;
         Ok(response.goal_id)
     }
 }
@@ -186,9 +202,15 @@ fn course(plans: &Plans) -> record::Episode {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
+    use crate::presence::Alive;
     use service_kit::SessionConfig;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::time::Duration;
+    use tokio::sync::watch;
+    use wire::query;
+    use zenoh::Session;
+    use zenoh::key_expr::OwnedKeyExpr;
     use zenoh::query::Query;
 
     const DIGEST: &str = "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff";
@@ -262,12 +284,17 @@ mod tests {
             query::reply(query, result).unwrap();
         })
         .await;
-        (Link { session, planner: "p".into(), timeout: Duration::from_secs(10) }, registered)
+        let (timeout, recovery) = (Duration::from_secs(10), Duration::ZERO);
+        (Link { session, timeout, recovery, alive: watch::channel(Alive::default()).1 }, registered)
     }
 
     fn model(digest: &str) -> Model {
         let (name, method, digest) = ("cpn".into(), "cpn".into(), digest.into());
         Model { name, method, digest, training_tasks: Vec::new(), horizon: 1 }
+    }
+
+    fn with(worker: &str) -> Services {
+        Services { planner: "p".into(), worker: worker.into() }
     }
 
     fn variation(task: &str, seed: u64) -> Variation {
@@ -278,7 +305,7 @@ mod tests {
     async fn a_forgotten_goal_is_registered_again_and_the_episode_recorded() {
         let (link, registered) = forgetful().await;
         let goal = GoalSource::SameVariation;
-        let attempt = attempt(&link, "w", &model(DIGEST), &variation("reach", 1), goal).await.unwrap();
+        let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), goal).await.unwrap();
         assert_eq!(registered.load(Ordering::SeqCst), 2);
         assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
         let plans = attempt.plans;
@@ -295,25 +322,30 @@ mod tests {
     async fn faults_are_told_apart() {
         let (link, _) = forgetful().await;
         let fault = async |worker: &str, digest: &str, variation: Variation| {
-            attempt(&link, worker, &model(digest), &variation, GoalSource::SameVariation).await.unwrap_err()
+            attempt(&link, &with(worker), &model(digest), &variation, GoalSource::SameVariation).await.unwrap_err()
         };
         // The expert solves none of the variations whose goal could be shown.
         let goal = GoalSource::OtherVariation;
-        let other = attempt(&link, "w", &model(DIGEST), &variation("reach", 99), goal).await;
+        let other = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 99), goal).await;
         assert!(matches!(other, Err(Fault::NoGoalImage)));
         // It solves seed 12, not 13, and the one after, whose goal is shown instead.
-        attempt(&link, "w", &model(DIGEST), &variation("reach", 12), goal).await.unwrap();
+        attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 12), goal).await.unwrap();
         assert!(matches!(fault("w", DIGEST, variation("reach", 13)).await, Fault::NoGoalImage));
         assert!(
             matches!(fault("w", DIGEST, variation("unknown", 1)).await, Fault::Refused(e) if e.field == "variation.task")
         );
+        let nobody = fault("nobody", DIGEST, variation("reach", 1)).await;
         assert!(
-            matches!(fault("nobody", DIGEST, variation("reach", 1)).await, Fault::Broken(e) if e.code == Code::Unavailable)
+            matches!(nobody, Fault::Outage { by: Service::Worker(name), error } if name == "nobody" && error.code == Code::Unavailable)
         );
         // The planner does not keep the checkpoint any more.
-        let other = "0".repeat(64);
+        let other = fault("w", &"0".repeat(64), variation("reach", 1)).await;
         assert!(
-            matches!(fault("w", &other, variation("reach", 1)).await, Fault::Broken(e) if e.field == "model_digest")
+            matches!(other, Fault::Outage { by: Service::Planner(name), error } if name == "p" && error.field == "model_digest")
         );
+        // The worker was started anew; it has a fault of its own.
+        let of_worker = |code, field: &str| Fault::new(Service::Worker("w".into()), Error::new(code, field, "", ""));
+        assert!(matches!(of_worker(Code::NotFound, "episode_id"), Fault::Outage { .. }));
+        assert!(matches!(of_worker(Code::Internal, ""), Fault::Broken { .. }));
     }
 }

@@ -136,7 +136,7 @@ async fn lose(lost: Lost) {
     let one = lab.evaluate(&[&arguments[..4], &["--trials", "1", "--wait-secs", "120"]].concat()).await;
     assert!(one.success);
 
-    let arguments = [&arguments[..6], &["--wait-secs", "2", "--timeout-secs", "5"]].concat();
+    let arguments = [&arguments[..6], &["--wait-secs", "2", "--timeout-secs", "5", "--recovery-secs", "1"]].concat();
     let evaluation = lab.evaluation(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let second = lab.out().join("trials/reach/random/1000001.json");
     timeout(LIMIT, async {

@@ -20,7 +20,7 @@ fn run() -> Run {
         title: "Lock & drawer".into(),
         command: "cpn-eval run --tasks door-lock,drawer-close".into(),
         date: "2026-01-02T03:04:05Z".into(),
-        planner: "planner".into(),
+        planners: vec!["planner-0".into(), "planner-1".into()],
         models: vec![model("cpn", "a", &["drawer-close", "reach"]), model("random", "b", &[])],
         tasks: vec!["door-lock".into(), "drawer-close".into()],
         trials: 4,
@@ -112,8 +112,15 @@ fn the_page_needs_nothing_else_and_escapes_what_it_shows() {
     let (root, folder) = folder();
     evaluator::report(root.path()).unwrap();
     let html = std::fs::read_to_string(folder.path("report.html")).unwrap();
-    for part in ["Lock &amp; drawer", "door-lock", "held out", "&lt;an answer&gt;", "10–11, 13–14", "First failure"]
-    {
+    for part in [
+        "Lock &amp; drawer",
+        "door-lock",
+        "held out",
+        "&lt;an answer&gt;",
+        "10–11, 13–14",
+        "First failure",
+        "planner-0, planner-1",
+    ] {
         assert!(html.contains(part), "{part}");
     }
     for part in ["http://", "https:&#x2f;&#x2f;", "<script", "<link", "url("] {
@@ -123,6 +130,17 @@ fn the_page_needs_nothing_else_and_escapes_what_it_shows() {
         serde_json::from_slice(&std::fs::read(folder.path("summary.json")).unwrap()).unwrap();
     assert_eq!(summary["rows"][0]["successes"], 3);
     assert_eq!(summary["rows"][0]["training"], "held-out");
+}
+
+#[test]
+fn a_run_that_names_a_single_planner_is_read() {
+    let (root, folder) = folder();
+    let path = folder.path("run.json");
+    let mut run: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    run.as_object_mut().unwrap().remove("planners").unwrap();
+    run["planner"] = "planner".into();
+    std::fs::write(&path, run.to_string()).unwrap();
+    assert_eq!(evaluator::report(root.path()).unwrap().run.planners, ["planner"]);
 }
 
 #[test]
