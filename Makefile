@@ -7,10 +7,11 @@ WORKER := sim-worker/.venv
 EXPORT := export/.venv
 BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
+COMPOSE ?= docker-compose
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -68,6 +69,16 @@ sign-models: | $(UV) ## Sign the shipped checkpoints (KEY=private key in PEM), a
 
 export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (DATASET=folder, OUT=folder)
 	$(EXPORT)/bin/cpn-export-lerobot --dataset $(or $(DATASET),data/demonstrations) --out $(or $(OUT),data/lerobot)
+
+bases: ## Make local images under the names of the public base images, where no image registry is reachable
+	deploy/bases/make.sh
+
+stack: ## Build the containers, evaluate in them, leave the report in runs/stack (COMPOSE="docker compose" for version 2)
+	$(COMPOSE) build
+	$(COMPOSE) up --detach
+	$(COMPOSE) logs --follow evaluator
+	mkdir -p runs && rm -rf runs/stack && docker cp "$$($(COMPOSE) ps --all --quiet evaluator):/report" runs/stack
+	exit "$$(docker wait "$$($(COMPOSE) ps --all --quiet evaluator)")"
 
 test: setup ## Everything that must pass
 	cargo test --workspace --locked
