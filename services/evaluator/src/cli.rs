@@ -22,7 +22,7 @@ pub enum Command {
     /// Report again from the records of a run.
     Report(ReportArgs),
     /// Ask a planner again for every plan of a recorded episode, and compare the answers bit for bit.
-    Replay(ReplayArgs),
+    Replay(Box<ReplayArgs>),
 }
 
 /// Arguments of `run`.

@@ -33,24 +33,8 @@ impl Lab {
         static LABS: AtomicUsize = AtomicUsize::new(0);
         let namespace = format!("test-{}-{}", std::process::id(), LABS.fetch_add(1, Ordering::SeqCst));
         let folder = tempfile::tempdir().unwrap();
-        let provenance = Provenance {
-            training_tasks: vec!["door-open".into()],
-            data_digest: "0".repeat(64),
-            render_spec: String::new(),
-            seed: 0,
-            training: cpn::Training::paper(),
-        };
-        let models_dir = folder.path().join("models");
-        std::fs::create_dir(&models_dir).unwrap();
-        let paper = ModelConfig::paper(MethodKind::Cpn);
-        let of_positions =
-            ModelConfig { encoder: EncoderConfig::position([600, 0, 200], 70), actions: 3, ..paper.clone() };
-        for (name, config) in [("cpn", paper), ("jenga", of_positions)] {
-            let bytes = checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap();
-            std::fs::write(models_dir.join(name).with_extension("safetensors"), bytes).unwrap();
-        }
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let models_dir = models(folder.path(), seed);
+        let endpoint = free_endpoint();
         let session =
             SessionConfig { listen: vec![endpoint.clone()], namespace: Some(namespace.clone()), ..Default::default() };
         let grpc_listen = "127.0.0.1:0".parse().unwrap();
@@ -90,6 +74,32 @@ impl Lab {
     pub async fn replay(&self, file: &Path) -> Ended {
         Ended::of(self.command("replay").arg(file).output()).await
     }
+}
+
+/// A folder in `folder` with the models "cpn" of pictures and "jenga" of positions, with weights drawn from `seed`.
+pub fn models(folder: &Path, seed: u64) -> PathBuf {
+    let provenance = Provenance {
+        training_tasks: vec!["door-open".into()],
+        data_digest: "0".repeat(64),
+        render_spec: String::new(),
+        seed: 0,
+        training: cpn::Training::paper(),
+    };
+    let models_dir = folder.join("models");
+    std::fs::create_dir(&models_dir).unwrap();
+    let paper = ModelConfig::paper(MethodKind::Cpn);
+    let of_positions = ModelConfig { encoder: EncoderConfig::position([600, 0, 200], 70), actions: 3, ..paper.clone() };
+    for (name, config) in [("cpn", paper), ("jenga", of_positions)] {
+        let bytes = checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap();
+        std::fs::write(models_dir.join(name).with_extension("safetensors"), bytes).unwrap();
+    }
+    models_dir
+}
+
+/// An endpoint on the loopback that nobody listens on.
+pub fn free_endpoint() -> String {
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    format!("tcp/127.0.0.1:{port}")
 }
 
 /// What a finished `cpn-eval` said.
