@@ -283,38 +283,70 @@ def test_worker_is_found_again_after_its_router(simulator: Simulator) -> None:
             assert process.wait(timeout=READY_SECONDS) == 0
 
 
-def test_second_worker_of_a_name_is_refused(session: zenoh.Session, start_worker: StartWorker, endpoint: str) -> None:
-    start_worker("twin")
-    command = [COMMAND, "serve", "--worker", "twin", "--connect", endpoint]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 1
-    assert "worker: expected a name that no running worker has, got 'twin'" in run.stderr
-    assert "stop the other worker, or give this one another --worker" in run.stderr
-    Worker(session, "twin").reset()
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_second_worker_of_a_name_is_refused(mode: str) -> None:
+    endpoint = free_endpoint()
+    with open_session(router(endpoint)), open_session(client(endpoint)) as session:
+        # Beside a router, who holds a name is known at once, by peers too.
+        token = session.liveliness().declare_token(keys.sim_alive("twin"))
+        command = [COMMAND, "serve", "--worker", "twin", "--mode", mode, "--connect", endpoint]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert run.returncode == 1
+        assert "worker twin runs elsewhere or has just died; waiting for it to go" in run.stderr
+        assert "worker: expected a name that no running worker has, got 'twin'" in run.stderr
+        assert "stop the other worker, or give this one another --worker" in run.stderr
+        token.undeclare()
 
 
-def test_name_of_a_worker_that_died_is_taken_over(session: zenoh.Session, endpoint: str) -> None:
-    config = ServeConfig(worker="late", zenoh=ZenohConfig(connect=(endpoint,)))
-    stop = threading.Event()
-    with open_session(config.zenoh) as heir:
-        claim_name(heir, config, stop)
-        lingering = session.liveliness().declare_token(keys.sim_alive("late"))
-        wait_for(lambda: list(heir.liveliness().get(keys.sim_alive("late"), timeout=READY_SECONDS)))
+def test_second_worker_of_a_name_among_peers_is_refused(
+    session: zenoh.Session, start_worker: StartWorker, endpoint: str
+) -> None:
+    start_worker("double")
+    with open_session(ZenohConfig(connect=(endpoint,))) as peer, pytest.raises(NameTakenError, match="got 'double'"):
+        claim_name(peer, "double", threading.Event(), patience_seconds=0)
+    Worker(session, "double").reset()
+
+
+def test_name_of_a_worker_that_died_is_taken_over() -> None:
+    endpoint = free_endpoint()
+    key = keys.sim_alive("late")
+    with open_session(router(endpoint)), open_session(client(endpoint)) as late, open_session(client(endpoint)) as heir:
+        stop = threading.Event()
+        claim_name(heir, "late", stop)
+        lingering = late.liveliness().declare_token(key)
+        wait_for(lambda: list(heir.liveliness().get(key, timeout=READY_SECONDS)))
         with pytest.raises(NameTakenError, match="got 'late'"):
-            claim_name(heir, config, stop, patience_seconds=0)
+            claim_name(heir, "late", stop, patience_seconds=0)
 
-        claims = threading.Thread(target=claim_name, args=(heir, config, stop, READY_SECONDS))
+        claims = threading.Thread(target=claim_name, args=(heir, "late", stop, READY_SECONDS))
         claims.start()
         lingering.undeclare()
         claims.join(READY_SECONDS)
         assert not claims.is_alive()
 
-        lingering = session.liveliness().declare_token(keys.sim_alive("late"))
-        wait_for(lambda: list(heir.liveliness().get(keys.sim_alive("late"), timeout=READY_SECONDS)))
         stop.set()
         with pytest.raises(StoppedError):
-            claim_name(heir, config, stop)
-        lingering.undeclare()
+            claim_name(heir, "late", stop)
+
+
+def test_name_is_not_free_for_the_reason_that_the_router_is_lost() -> None:
+    endpoint = free_endpoint()
+    stop = threading.Event()
+    with ExitStack() as stack:
+        with open_session(router(endpoint)):
+            holder = stack.enter_context(open_session(client(endpoint)))
+            heir = stack.enter_context(open_session(client(endpoint)))
+            token = holder.liveliness().declare_token(keys.sim_alive("held"))
+            wait_for(lambda: list(heir.liveliness().get(keys.sim_alive("held"), timeout=READY_SECONDS)))
+            claims = threading.Thread(target=claim_name, args=(heir, "held", stop, READY_SECONDS))
+            claims.start()
+        wait_for(lambda: not is_connected(heir))
+        with open_session(router(endpoint)):
+            wait_for(lambda: is_connected(heir) and is_connected(holder))
+            assert claims.is_alive()
+            token.undeclare()
+            claims.join(READY_SECONDS)
+            assert not claims.is_alive()
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.episode import EpisodeRunner
 from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.session import REMINDER_SECONDS, StoppedError, ZenohConfig, is_connected, open_session
+from cpn_sim_worker.session import REMINDER_SECONDS, StoppedError, ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.wire import RequestError, decode, encoding
 
@@ -37,8 +37,9 @@ LEASE_SECONDS = 15.0
 """Time that the token of a worker that has died may linger: zenoh's lease, 10 s, and some more."""
 ANSWER_SECONDS = 2.0
 """Time that the network has to name the holders of a token."""
-MEETING_SECONDS = 1.0
-"""Time that a peer has to meet others before it looks who is there."""
+MEETING_SECONDS = 1.5
+"""Time after a change of connections in which others may still be joining: peers find each other one by one, and come
+back one by one to a router that was started again."""
 
 
 @dataclass(frozen=True)
@@ -64,40 +65,43 @@ class NameTakenError(Exception):
 
 
 def claim_name(
-    session: zenoh.Session,
-    config: ServeConfig,
-    stop: threading.Event,
-    patience_seconds: float = LEASE_SECONDS,
+    session: zenoh.Session, worker: str, stop: threading.Event, patience_seconds: float = LEASE_SECONDS
 ) -> None:
     """Waits until no other worker has the name: two would each get a part of the requests.
+
+    A worker that joins the network later than this one looks goes unnoticed.
 
     Raises:
         NameTakenError: If another worker still has it after `patience_seconds`.
         StoppedError: If `stop` was set meanwhile.
     """
-    start = time.monotonic()
-    while config.zenoh.connect and not is_connected(session) and time.monotonic() - start < MEETING_SECONDS:
-        stop.wait(POLL_SECONDS)
-    met = is_connected(session)
-
-    key = keys.sim_alive(config.worker)
-    start = time.monotonic()
+    key = keys.sim_alive(worker)
+    start = last_change = time.monotonic()
+    connected: set[str] = set()
+    was_connected = False
     reminded = None
     while not stop.is_set():
         replies = list(session.liveliness().get(key, timeout=ANSWER_SECONDS))
-        # The name is not free for the reason that the network answers too late, or was lost.
-        if not replies and (is_connected(session) or not met):
-            return
         taken = any(reply.ok is not None for reply in replies)
+
         now = time.monotonic()
+        others = {str(other) for other in (*session.info.routers_zid(), *session.info.peers_zid())}
+        if others != connected:
+            connected, last_change = others, now
+        was_connected = was_connected or bool(connected)
+        lost = was_connected and not connected
+
+        # A late answer does not free the name, nor does none from a network that was lost.
+        if not replies and not lost and now - last_change >= MEETING_SECONDS:
+            return
         if taken and now - start >= patience_seconds:
             raise NameTakenError(
-                f"worker: expected a name that no running worker has, got {config.worker!r}: "
+                f"worker: expected a name that no running worker has, got {worker!r}: "
                 "stop the other worker, or give this one another --worker"
             )
         if taken and (reminded is None or now - reminded >= REMINDER_SECONDS):
             reminded = now
-            log.warning("worker %s runs elsewhere or has just died; waiting for it to go", config.worker)
+            log.warning("worker %s runs elsewhere or has just died; waiting for it to go", worker)
         stop.wait(POLL_SECONDS)
     raise StoppedError("stopped before the worker's name was free")
 
@@ -207,7 +211,7 @@ def serve(config: ServeConfig) -> None:
     episodes = EpisodeRunner(Simulator(Renderer()), config.max_steps)
     try:
         with open_session(config.zenoh, stop) as session:
-            claim_name(session, config, stop)
+            claim_name(session, config.worker, stop)
             SimServer(session, config.worker, episodes).run(stop)
     except StoppedError as error:
         log.info("%s", error)
