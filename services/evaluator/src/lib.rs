@@ -35,7 +35,8 @@ use service_kit::session::Connection;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
+use tokio::time::Instant;
 use wire::key;
 use wire::planner::{ListModelsRequest, ListModelsResponse, ModelInfo};
 use zenoh::Session;
@@ -56,8 +57,7 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     let session = link::join(&args.session, patience).await?;
     let _connection = Connection::follow(&session, &args.session);
     let mut alive = presence::follow(&session, &args.planner).await?;
-    let left = patience.saturating_sub(start.elapsed());
-    presence::wait(&session, &mut alive, &args.planner, args.workers, left).await?;
+    presence::wait(&session, &mut alive, &args.planner, args.workers, start, patience).await?;
 
     let run = Run {
         format: FORMAT,

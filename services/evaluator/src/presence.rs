@@ -6,6 +6,7 @@ use std::fmt;
 use std::future::pending;
 use std::time::Duration;
 use tokio::sync::watch;
+use tokio::time::Instant;
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::sample::{Sample, SampleKind};
@@ -108,12 +109,14 @@ pub(crate) async fn gone(mut alive: watch::Receiver<Alive>, service: &Service, g
     }
 }
 
-/// Waits until all the planners and so many workers are alive, and tells what is missing meanwhile.
+/// Waits until all the planners and so many workers are alive, for `patience` since `start`, and tells what is missing
+/// meanwhile.
 pub(crate) async fn wait(
     session: &Session,
     alive: &mut watch::Receiver<Alive>,
     planners: &[String],
     workers: u32,
+    start: Instant,
     patience: Duration,
 ) -> anyhow::Result<()> {
     let missing = |alive: &Alive| {
@@ -131,7 +134,7 @@ pub(crate) async fn wait(
             alive.changed().await?;
         }
     };
-    match tokio::time::timeout(patience, patient).await {
+    match tokio::time::timeout_at(start + patience, patient).await {
         Ok(result) => result,
         Err(_) => {
             let missing = missing(&alive.borrow()).unwrap_or_default();

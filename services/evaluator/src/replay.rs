@@ -5,7 +5,8 @@ use crate::{link, presence};
 use anyhow::Context;
 use recording::plans::{self, Exchange};
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+use tokio::time::Instant;
 use wire::planner::{Goal, PlanRequest, PlanResponse, Search};
 use wire::{Observation, key};
 
@@ -60,7 +61,7 @@ pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     let session = link::join(&args.session, WAIT).await?;
     let planners = [args.planner.clone()];
     let mut alive = presence::follow(&session, &planners).await?;
-    presence::wait(&session, &mut alive, &planners, 0, WAIT.saturating_sub(start.elapsed())).await?;
+    presence::wait(&session, &mut alive, &planners, 0, start, WAIT).await?;
 
     let key = key::planner_plan(&args.planner)?;
     let exchanges = recorded.exchanges();
