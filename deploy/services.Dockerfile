@@ -53,7 +53,10 @@ COPY services services
 RUN cargo build --release --locked --workspace --bins
 
 # Empty folders, owned by the services' user: a volume that is mounted there the first time takes the ownership over.
-RUN mkdir -p /folders/models /folders/data /folders/report /folders/certificates
+RUN mkdir -p /folders/data /folders/report \
+ && for folder in authority router planner trainer worker evaluator viewer client operator; do \
+      mkdir -p "/folders/certificates/$folder"; \
+    done
 
 FROM ${DEBIAN_IMAGE} AS base
 
