@@ -42,15 +42,27 @@ pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
 /// # Errors
 /// If the folder cannot be made or written.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    write(path, bytes, 0o666)
+}
+
+/// The same for what nobody else may read.
+///
+/// # Errors
+/// If the folder cannot be made or written.
+pub fn write_secret(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    write(path, bytes, 0o600)
+}
+
+fn write(path: &Path, bytes: &[u8], mode: u32) -> anyhow::Result<()> {
     let write = || {
         let folder = path.parent().context("a path without a folder")?;
         if !folder.exists() {
             std::fs::create_dir_all(folder)?;
             sync(folder.parent().unwrap_or(folder))?;
         }
-        // Temporary files are private by default; this one becomes an ordinary file, as the umask would have it.
-        let ordinary = Permissions::from_mode(0o666);
-        let mut file = tempfile::Builder::new().prefix(UNFINISHED).permissions(ordinary).tempfile_in(folder)?;
+        // Temporary files are private by default; the umask decides what becomes of the mode.
+        let permissions = Permissions::from_mode(mode);
+        let mut file = tempfile::Builder::new().prefix(UNFINISHED).permissions(permissions).tempfile_in(folder)?;
         file.write_all(bytes)?;
         file.as_file().sync_all()?;
         file.persist(path)?;

@@ -10,12 +10,12 @@ use serde_json::{Value, json};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use tokio::sync::watch;
+use tokio::sync::{oneshot, watch};
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::task::AbortOnDropHandle;
 use tracing::{info, warn};
-use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::{Session, Wait};
 
 /// Interval between two messages that nobody is connected.
 const REMINDER: Duration = Duration::from_secs(5);
@@ -259,13 +259,15 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
 pub async fn open(config: &SessionConfig) -> anyhow::Result<Session> {
     let zenoh = config.zenoh()?;
     let reached = endpoints(&zenoh, "connect/endpoints", get(&zenoh, "mode")?.as_str().unwrap_or("peer"))?.join(", ");
-    let opening = async { zenoh::open(zenoh).await.map_err(|e| anyhow!(e)).context("opening the zenoh session") };
-    tokio::pin!(opening);
+    // Zenoh blocks until the router is there, in a single poll: on a thread of its own, nobody else waits with it.
+    let (sender, mut opened) = oneshot::channel();
+    let open = move || drop(sender.send(zenoh::open(zenoh).wait()));
+    std::thread::Builder::new().name("zenoh-open".into()).spawn(open)?;
     let mut reminder = interval(REMINDER);
     reminder.tick().await;
     loop {
         tokio::select! {
-            session = &mut opening => return session,
+            session = &mut opened => return session?.map_err(|e| anyhow!(e)).context("opening the zenoh session"),
             _ = reminder.tick() => warn!(endpoints = reached, "no router answers; trying again"),
         }
     }

@@ -2,7 +2,9 @@
 //!
 //! A router's access control, and the checks of gRPC, openpi and metrics, are made from it.
 
-use crate::{Error, key};
+use crate::planner::{LoadModelRequest, PlanRequest};
+use crate::training::ListRunsResponse;
+use crate::{Error, Message, key};
 use std::fmt;
 use std::str::FromStr;
 use zenoh::key_expr::OwnedKeyExpr;
@@ -95,6 +97,8 @@ pub struct Endpoint {
     pub used_by: &'static [Role],
     /// Path of the same over gRPC.
     pub grpc: Option<&'static str>,
+    /// Largest payload, in bytes, of what is sent.
+    pub max_bytes: usize,
 }
 
 impl Endpoint {
@@ -120,7 +124,10 @@ pub const ENDPOINTS: &[Endpoint] = &[
         &[Evaluator, Client, Operator, Viewer],
         "/cpn.v1.PlannerService/ListModels",
     ),
-    query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel"),
+    Endpoint {
+        max_bytes: LoadModelRequest::MAX_BYTES,
+        ..query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel")
+    },
     zenoh(Kind::Query, || key::sim_reset("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Query, || key::sim_step("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Publication, || key::sim_frame("*"), &[Worker], &[Viewer]),
@@ -138,7 +145,10 @@ pub const ENDPOINTS: &[Endpoint] = &[
     zenoh(Kind::Query, || key::checkpoint_roll_back("*"), &[Trainer], &[Operator]),
     query(|| key::trainer_start_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StartRun"),
     query(|| key::trainer_stop_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StopRun"),
-    query(|| key::trainer_list_runs("*"), &[Trainer], &[Operator, Viewer], "/cpn.v1.TrainerService/ListRuns"),
+    Endpoint {
+        max_bytes: ListRunsResponse::MAX_BYTES,
+        ..query(|| key::trainer_list_runs("*"), &[Trainer], &[Operator, Viewer], "/cpn.v1.TrainerService/ListRuns")
+    },
     Endpoint {
         grpc: Some("/cpn.v1.TrainerService/WatchRun"),
         ..zenoh(Kind::Publication, || key::training_progress("*"), &[Trainer], &[Operator, Viewer])
@@ -162,7 +172,7 @@ const fn zenoh(
     offered_by: &'static [Role],
     used_by: &'static [Role],
 ) -> Endpoint {
-    Endpoint { kind, key, offered_by, used_by, grpc: None }
+    Endpoint { kind, key, offered_by, used_by, grpc: None, max_bytes: PlanRequest::MAX_BYTES }
 }
 
 const fn query(
@@ -171,7 +181,7 @@ const fn query(
     used_by: &'static [Role],
     grpc: &'static str,
 ) -> Endpoint {
-    Endpoint { kind: Kind::Query, key, offered_by, used_by, grpc: Some(grpc) }
+    Endpoint { grpc: Some(grpc), ..zenoh(Kind::Query, key, offered_by, used_by) }
 }
 
 /// Whether an identity may call a method of gRPC, by its path.

@@ -4,13 +4,11 @@
 //! its number, and a reset that comes late ends the episode, so that the next step is refused.
 
 use crate::presence::{self, Alive, Service};
-use anyhow::{Context, bail};
+use anyhow::bail;
 use backon::{ExponentialBuilder, Retryable};
 use service_kit::SessionConfig;
-use std::thread;
 use std::time::{Duration, Instant};
-use tokio::runtime::Handle;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::watch;
 use wire::{Code, Error, Message, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
@@ -59,13 +57,8 @@ impl Link {
 /// # Errors
 /// If the session cannot be opened, or its router is not there within `patience`.
 pub(crate) async fn join(config: &SessionConfig, patience: Duration) -> anyhow::Result<Session> {
-    // Zenoh opens a client's session in a single poll, which lasts until the router is there: on a thread that can be left.
-    let (sender, opened) = oneshot::channel();
-    let (runtime, own) = (Handle::current(), config.clone());
-    thread::spawn(move || sender.send(runtime.block_on(service_kit::session::open(&own))));
-
-    match tokio::time::timeout(patience, opened).await {
-        Ok(session) => session.context("opening the zenoh session")?,
+    match tokio::time::timeout(patience, service_kit::session::open(config)).await {
+        Ok(session) => session,
         Err(_) => {
             let (routers, seconds) = (config.connect.join(", "), patience.as_secs());
             bail!("no router at {routers} within {seconds} s: is it running, and is --connect right?")

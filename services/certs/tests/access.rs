@@ -1,0 +1,117 @@
+//! Every role at every endpoint, through a router with the generated configuration.
+
+#![expect(clippy::unwrap_used, reason = "tests")]
+
+mod common;
+
+use common::Network;
+use futures::future::join_all;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
+use zenoh::query::QueryTarget;
+use zenoh::{Session, Wait};
+
+/// Time for what is allowed to arrive, and for what is denied not to.
+const SETTLED: Duration = Duration::from_millis(500);
+/// Time that a query has.
+const TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Pairs of roles, of which the second may use what the first offers. A router passes on everything.
+fn expected(endpoint: &Endpoint) -> BTreeSet<(Role, Role)> {
+    let may = |roles: &[Role], role| role == Role::Router || roles.contains(&role);
+    let pairs = Role::ALL.into_iter().flat_map(|offering| Role::ALL.map(|using| (offering, using)));
+    pairs.filter(|(offering, using)| may(endpoint.offered_by, *offering) && may(endpoint.used_by, *using)).collect()
+}
+
+/// The key at which a role offers.
+fn key_of(endpoint: &Endpoint, role: Role) -> String {
+    endpoint.key().unwrap().replace('*', role.name())
+}
+
+/// Pairs of roles, of which the second gets an answer of the first.
+async fn answered(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+    let mut queryables = Vec::new();
+    for (role, session) in sessions {
+        let key = key_of(endpoint, *role);
+        let queryable = session.declare_queryable(key.clone()).complete(true);
+        queryables.push(queryable.callback(move |query| query.reply(&key, "yes").wait().unwrap()).await.unwrap());
+    }
+    tokio::time::sleep(SETTLED).await;
+    let asked = sessions.iter().flat_map(|(using, session)| {
+        Role::ALL.map(|offering| async move {
+            let key = key_of(endpoint, offering);
+            let replies = session.get(key).target(QueryTarget::All).timeout(TIMEOUT).await.unwrap();
+            let mut answered = false;
+            while let Ok(reply) = replies.recv_async().await {
+                answered |= reply.result().is_ok();
+            }
+            answered.then_some((offering, *using))
+        })
+    });
+    join_all(asked).await.into_iter().flatten().collect()
+}
+
+/// Pairs of roles, of which the second hears what the first publishes.
+async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+    let heard = Arc::new(Mutex::new(BTreeSet::new()));
+    let mut subscribers = Vec::new();
+    for (using, session) in sessions {
+        let (using, heard) = (*using, Arc::clone(&heard));
+        let subscriber = session.declare_subscriber(endpoint.key().unwrap()).callback(move |sample| {
+            let offering = sample.payload().try_to_string().unwrap().parse().unwrap();
+            heard.lock().unwrap().insert((offering, using));
+        });
+        subscribers.push(subscriber.await.unwrap());
+    }
+    tokio::time::sleep(SETTLED).await;
+    for (offering, session) in sessions {
+        session.put(key_of(endpoint, *offering), offering.name()).await.unwrap();
+    }
+    tokio::time::sleep(SETTLED).await;
+    heard.lock().unwrap().clone()
+}
+
+/// Pairs of roles, of which the second sees the token of the first.
+async fn seen(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+    let mut tokens = Vec::new();
+    for (role, session) in sessions {
+        tokens.push(session.liveliness().declare_token(key_of(endpoint, *role)).await.unwrap());
+    }
+    tokio::time::sleep(SETTLED).await;
+    let mut seen = BTreeSet::new();
+    for (using, session) in sessions {
+        let found = session.liveliness().get(endpoint.key().unwrap()).timeout(TIMEOUT).await.unwrap();
+        while let Ok(reply) = found.recv_async().await {
+            let Ok(sample) = reply.into_result() else { continue };
+            let offering = sample.key_expr().rsplit_once('/').unwrap().1.parse().unwrap();
+            seen.insert((offering, *using));
+        }
+    }
+    seen
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_role_does_what_it_may_and_nothing_else() {
+    let network = Network::start().await;
+    let mut sessions = BTreeMap::new();
+    for role in Role::ALL {
+        sessions.insert(role, network.session(role.name()).await);
+    }
+    for endpoint in ENDPOINTS {
+        let mut expected = expected(endpoint);
+        let found = match endpoint.kind {
+            Kind::Query => answered(endpoint, &sessions).await,
+            Kind::Publication => heard(endpoint, &sessions).await,
+            Kind::Liveliness => seen(endpoint, &sessions).await,
+        };
+        // A session reaches itself without the router.
+        expected.retain(|(offering, using)| offering != using);
+        let found: BTreeSet<_> = found.into_iter().filter(|(offering, using)| offering != using).collect();
+        let denied: Vec<_> = expected.difference(&found).collect();
+        let allowed: Vec<_> = found.difference(&expected).collect();
+        let key = endpoint.key().unwrap();
+        assert!(denied.is_empty() && allowed.is_empty(), "{key}: denied {denied:?}, allowed {allowed:?}");
+    }
+}
