@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "$0")/../fuzz"
 
 broken=()
-for fuzzer in messages checkpoint recording openpi; do
+for fuzzer in messages checkpoint recording openpi signature; do
     echo "== $fuzzer"
     mkdir -p "artifacts/$fuzzer"
     cargo run --quiet --release --locked --bin "$fuzzer" -- "corpus/$fuzzer" -artifact_prefix="artifacts/$fuzzer/" \

@@ -31,8 +31,8 @@ fn each_crate_knows_only_what_it_may() {
         ("recording", &["wire"]),
         ("signing", &[]),
         ("certs", &["service-kit", "wire"]),
-        ("planner", &["cpn", "wire", "service-kit"]),
-        ("trainer", &["cpn", "recording", "wire", "service-kit"]),
+        ("planner", &["cpn", "signing", "wire", "service-kit"]),
+        ("trainer", &["cpn", "recording", "signing", "wire", "service-kit"]),
         ("evaluator", &["recording", "wire", "service-kit"]),
     ]);
     let dependencies = dependencies();
@@ -52,6 +52,7 @@ fn the_method_knows_no_network_and_messages_no_tensors() {
     let knows = |name: &str, others: &[&str]| others.iter().any(|other| dependencies[name].contains(*other));
     assert!(!knows("cpn", &["tokio", "zenoh", "tonic", "prost", "tracing"]));
     assert!(!knows("wire", &["tch", "tokio"]));
+    assert!(!knows("signing", &["tch", "tokio", "tracing"]));
     assert!(!knows("recording", &["tch", "tokio", "zenoh"]));
     assert!(!knows("evaluator", &["tch"]));
 }

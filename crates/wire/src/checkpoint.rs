@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// Largest piece of a checkpoint in one reply: zenoh's batch size.
 pub const MAX_CHUNK_BYTES: u32 = 65_536;
+/// Largest signature bundle, in bytes.
+pub const MAX_SIGNATURE_BUNDLE_BYTES: usize = 65_536;
 /// Most parents of a checkpoint.
 const MAX_PARENTS: usize = 64;
 
@@ -25,6 +27,9 @@ pub struct CheckpointManifest {
     pub config_digest: String,
     /// Digests of what it was made from, in hex.
     pub parents: Vec<String>,
+    /// Signature of the checkpoint, a bundle of OpenSSF Model Signing in JSON; not verified.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signature_bundle: Option<String>,
 }
 
 /// Tells planners which version of a model to serve.
@@ -116,10 +121,21 @@ impl TryFrom<proto::CheckpointManifest> for CheckpointManifest {
     type Error = Error;
 
     fn try_from(manifest: proto::CheckpointManifest) -> Result<Self, Error> {
-        let proto::CheckpointManifest { model, version: number, digest: sha256, size_bytes, config_digest, parents } =
-            manifest;
+        let proto::CheckpointManifest {
+            model,
+            version: number,
+            digest: sha256,
+            size_bytes,
+            config_digest,
+            parents,
+            signature_bundle,
+        } = manifest;
         if parents.len() > MAX_PARENTS {
             return Err(Error::invalid("parents", format!("at most {MAX_PARENTS}"), parents.len()));
+        }
+        if signature_bundle.len() > MAX_SIGNATURE_BUNDLE_BYTES {
+            let (expected, got) = (format!("at most {MAX_SIGNATURE_BUNDLE_BYTES} bytes"), signature_bundle.len());
+            return Err(Error::invalid("signature_bundle", expected, format!("{got} bytes")));
         }
         Ok(Self {
             model: name("model", model)?,
@@ -128,14 +144,17 @@ impl TryFrom<proto::CheckpointManifest> for CheckpointManifest {
             size_bytes,
             config_digest: digest("config_digest", config_digest)?,
             parents: parents.into_iter().map(|parent| digest("parents", parent)).collect::<Result<_, _>>()?,
+            signature_bundle: Some(signature_bundle).filter(|bundle| !bundle.is_empty()),
         })
     }
 }
 
 impl From<CheckpointManifest> for proto::CheckpointManifest {
     fn from(manifest: CheckpointManifest) -> Self {
-        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents } = manifest;
-        Self { model, version, digest, size_bytes, config_digest, parents }
+        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents, signature_bundle } =
+            manifest;
+        let signature_bundle = signature_bundle.unwrap_or_default();
+        Self { model, version, digest, size_bytes, config_digest, parents, signature_bundle }
     }
 }
 
@@ -221,6 +240,8 @@ impl From<ListVersionsRequest> for proto::ListVersionsRequest {
 
 impl Message for ListVersionsResponse {
     type Proto = proto::ListVersionsResponse;
+    /// Every version may have a signature.
+    const MAX_BYTES: usize = 16 << 20;
 }
 
 impl TryFrom<proto::ListVersionsResponse> for ListVersionsResponse {

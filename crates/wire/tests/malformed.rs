@@ -201,6 +201,7 @@ fn each_wrong_field_of_an_announcement_is_named() {
         size_bytes: 1,
         config_digest: digest(),
         parents: vec![digest()],
+        signature_bundle: "{}".into(),
     };
     let decode = |manifest| {
         let announcement = proto::CheckpointAnnouncement { manifest, promoted_unix_nanos: 1 };
@@ -209,13 +210,14 @@ fn each_wrong_field_of_an_announcement_is_named() {
     decode(Some(good())).unwrap();
     assert_eq!(decode(None).unwrap_err().field, "manifest");
     type Spoil = fn(&mut proto::CheckpointManifest);
-    let cases: [(Spoil, &str, &str); 6] = [
+    let cases: [(Spoil, &str, &str); 7] = [
         (|m| m.model = "../x".into(), "manifest.model", "\"../x\""),
         (|m| m.version = 0, "manifest.version", "0"),
         (|m| m.digest = "zz".into(), "manifest.digest", "\"zz\""),
         (|m| m.config_digest = String::new(), "manifest.config_digest", "\"\""),
         (|m| m.parents = vec!["zz".into()], "manifest.parents", "\"zz\""),
         (|m| m.parents = vec!["0".repeat(64); 65], "manifest.parents", "65"),
+        (|m| m.signature_bundle = "x".repeat(65_537), "manifest.signature_bundle", "65537 bytes"),
     ];
     for (spoil, field, got) in cases {
         let mut manifest = good();

@@ -81,14 +81,16 @@ fn info() -> impl Strategy<Value = ModelInfo> {
 }
 
 fn manifest() -> impl Strategy<Value = CheckpointManifest> {
-    (name(), 1u32.., digest(), any::<u64>(), digest(), vec(digest(), 0..3)).prop_map(
-        |(model, version, digest, size_bytes, config_digest, parents)| CheckpointManifest {
+    let bundle = option::of("\\PC{1,40}");
+    (name(), 1u32.., digest(), any::<u64>(), digest(), vec(digest(), 0..3), bundle).prop_map(
+        |(model, version, digest, size_bytes, config_digest, parents, signature_bundle)| CheckpointManifest {
             model,
             version,
             digest,
             size_bytes,
             config_digest,
             parents,
+            signature_bundle,
         },
     )
 }

@@ -1,8 +1,9 @@
 //! What the planner can be told: what was typed, and what came of it.
 
 use cpn::encoder::Precision;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use service_kit::SessionConfig;
+use signing::Trust;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::num::NonZeroU16;
 use std::path::PathBuf;
@@ -35,6 +36,11 @@ pub struct Config {
     /// What images are embedded in: bfloat16, where the processor has instructions for it (AVX512-BF16), is faster,
     /// and close.
     pub precision: Precision,
+    /// Policy towards checkpoints that no trusted key signed; if none is given, `warn` where there are trusted keys, else `off`.
+    pub trust: Option<Trust>,
+    /// Files of public keys, in PEM, whose signatures of checkpoints count.
+    #[serde(deserialize_with = "listed")]
+    pub trusted_keys: Vec<PathBuf>,
     /// Where Prometheus finds metrics; none are served if it is not given.
     pub metrics_listen: Option<SocketAddr>,
     /// File of the tokens that clients of gRPC, openpi and metrics may bear instead of a certificate.
@@ -60,11 +66,27 @@ impl Default for Config {
             batch_delay_ms: 0,
             threads: count(1),
             precision: Precision::Float32,
+            trust: None,
+            trusted_keys: Vec::new(),
             metrics_listen: None,
             tokens: None,
             session: SessionConfig::default(),
         }
     }
+}
+
+/// Paths in a list or, as in the environment, in one text with commas between them.
+fn listed<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "expected a list of files, or their names with commas between them")]
+    enum Paths {
+        List(Vec<PathBuf>),
+        Text(String),
+    }
+    Ok(match Paths::deserialize(deserializer)? {
+        Paths::List(paths) => paths,
+        Paths::Text(text) => text.split(',').filter(|path| !path.is_empty()).map(Into::into).collect(),
+    })
 }
 
 /// Serves plans from trained weights over zenoh and gRPC.
@@ -122,6 +144,14 @@ pub struct Args {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub precision: Option<String>,
+    /// Policy towards checkpoints that no trusted key signed [default: warn if there are trusted keys, else off].
+    #[arg(long, value_parser = ["off", "warn", "enforce"])]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trust: Option<String>,
+    /// Files of public keys, in PEM, whose signatures of checkpoints count.
+    #[arg(long, value_name = "FILE", value_delimiter = ',')]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub trusted_keys: Vec<PathBuf>,
     /// Where Prometheus finds metrics, for example 127.0.0.1:9465 [default: nowhere].
     #[arg(long, value_name = "ADDRESS")]
     #[serde(skip_serializing_if = "Option::is_none")]

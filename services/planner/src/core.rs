@@ -5,6 +5,7 @@ use crate::goals::Goals;
 use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::unknown_model;
+use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask, Reply};
 use anyhow::Context;
 use std::path::{Path, PathBuf};
@@ -30,6 +31,7 @@ pub struct PlannerCore {
     goals: Arc<Goals>,
     loads: Arc<Semaphore>,
     models_dir: Arc<Path>,
+    signatures: Arc<Signatures>,
     computing: Computing,
 }
 
@@ -37,7 +39,7 @@ impl PlannerCore {
     /// Loads every checkpoint of the model folder and starts to serve them.
     ///
     /// # Errors
-    /// Names the first checkpoint that cannot be loaded, and why.
+    /// Names the first checkpoint that cannot be loaded or is not signed as it must be, and why; or a file of keys.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
         let computing = Computing { precision: config.precision.where_faster(), threads: config.threads };
         if computing.precision != config.precision {
@@ -45,8 +47,9 @@ impl PlannerCore {
                 "precision: expected a processor with instructions for bfloat16 (AVX512-BF16), got none; embedding in float32"
             );
         }
-        let folder = config.models_dir.clone();
-        let models = tokio::task::spawn_blocking(move || load_all(&folder, computing)).await??;
+        let signatures = Arc::new(Signatures::new(config)?);
+        let (folder, checked) = (config.models_dir.clone(), Arc::clone(&signatures));
+        let models = tokio::task::spawn_blocking(move || load_all(&folder, &checked, computing)).await??;
         for Model { info, .. } in &models {
             info!(model = info.name, method = info.method, digest = info.digest, "serving");
         }
@@ -55,6 +58,7 @@ impl PlannerCore {
             goals: Arc::new(Goals::new(config.goal_capacity)),
             loads: Arc::new(Semaphore::new(MAX_LOADS)),
             models_dir: config.models_dir.clone().into(),
+            signatures,
             computing,
         })
     }
@@ -131,23 +135,33 @@ impl PlannerCore {
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint, with the reason; `NOT_FOUND` for a file that is not in the model
-    /// folder; `FAILED_PRECONDITION` for the name `random`; `RESOURCE_EXHAUSTED` if others are being loaded.
+    /// folder; `FAILED_PRECONDITION` for the name `random`, or if no trusted key signed it and that is refused;
+    /// `RESOURCE_EXHAUSTED` if others are being loaded.
     pub async fn load_model(&self, request: LoadModelRequest) -> Result<LoadModelResponse, Error> {
         check_replaceable(&request.model)?;
         let _load = self.loads.try_acquire().map_err(|_| {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
-        let (folder, computing) = (Arc::clone(&self.models_dir), self.computing);
-        Ok(LoadModelResponse { model: self.swap_in(move || Model::load(&folder, request, computing)).await? })
+        let (folder, signatures) = (Arc::clone(&self.models_dir), Arc::clone(&self.signatures));
+        let computing = self.computing;
+        let load = move || Model::load(&folder, request, &signatures, computing);
+        Ok(LoadModelResponse { model: self.swap_in(load).await? })
     }
 
-    /// The same with a published checkpoint, whose bytes must be what its manifest says.
+    /// The same with a published checkpoint, whose bytes must be what its manifest says; they are fetched only once its
+    /// signature has been checked.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint or another one, with the reason; `FAILED_PRECONDITION` for the name
-    /// `random`.
-    pub(crate) async fn load_published(&self, manifest: CheckpointManifest, bytes: Vec<u8>) -> Result<(), Error> {
+    /// `random`, or if no trusted key signed it and that is refused; those of `fetch`.
+    pub(crate) async fn load_published(
+        &self,
+        manifest: CheckpointManifest,
+        fetch: impl Future<Output = Result<Vec<u8>, Error>>,
+    ) -> Result<(), Error> {
         check_replaceable(&manifest.model)?;
+        self.signatures.check_published(&manifest)?;
+        let bytes = fetch.await?;
         // It comes once and unasked, so that it waits where a client would be sent away.
         let _load = self.loads.acquire().await;
         let computing = self.computing;
@@ -160,7 +174,7 @@ impl PlannerCore {
         self.serve(model).await
     }
 
-    /// Serves a method that is built already, in place of the one of its name, from the next plan on.
+    /// Serves a method that is built already, in place of the one of its name, from the next plan on. Nobody signs those.
     ///
     /// # Errors
     /// `FAILED_PRECONDITION` for the name `random`; `UNAVAILABLE` during shutdown.
@@ -184,10 +198,11 @@ impl PlannerCore {
 }
 
 /// `random` and every checkpoint in `folder`.
-fn load_all(folder: &Path, computing: Computing) -> anyhow::Result<Vec<Model>> {
+fn load_all(folder: &Path, signatures: &Signatures, computing: Computing) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
     for path in checkpoints(folder).with_context(|| format!("model folder {}", folder.display()))? {
-        models.push(load_file(folder, &path, computing).with_context(|| format!("checkpoint {}", path.display()))?);
+        let loaded = load_file(folder, &path, signatures, computing);
+        models.push(loaded.with_context(|| format!("checkpoint {}", path.display()))?);
     }
     if models.len() == 1 {
         warn!(folder = %folder.display(), "no checkpoints: only the random model is served");
@@ -207,14 +222,14 @@ fn checkpoints(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-fn load_file(folder: &Path, path: &Path, computing: Computing) -> Result<Model, Error> {
+fn load_file(folder: &Path, path: &Path, signatures: &Signatures, computing: Computing) -> Result<Model, Error> {
     let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let source = CheckpointSource::File(text(path.file_name()));
     let request = LoadModelRequest { model: text(path.file_stem()), source };
     // A file's name is as free as a stranger's message: the trip through the wire applies the same rules to it.
     let request: LoadModelRequest = wire::decode(&wire::encode(request))?;
     check_replaceable(&request.model)?;
-    Model::load(folder, request, computing)
+    Model::load(folder, request, signatures, computing)
 }
 
 fn check_replaceable(name: &str) -> Result<(), Error> {

@@ -1,4 +1,4 @@
-//! Follows what a trainer announces: fetches, verifies, tries, swaps.
+//! Follows what a trainer announces: checks its signature, fetches, verifies, tries, swaps.
 
 use crate::core::PlannerCore;
 use backon::{ConstantBuilder, Retryable};
@@ -32,7 +32,8 @@ impl Follower {
     /// may come in any order.
     ///
     /// # Errors
-    /// If the message is malformed, the checkpoint cannot be fetched or is not what its manifest says, or it is faulty.
+    /// If the message is malformed, the checkpoint's signature is refused, it cannot be fetched or is not what its manifest
+    /// says, or it is faulty.
     pub(crate) async fn follow(&mut self, message: &[u8]) -> Result<(), Error> {
         let CheckpointAnnouncement { manifest, promoted_unix_nanos } = wire::decode(message)?;
         let model = manifest.model.clone();
@@ -40,8 +41,8 @@ impl Follower {
             return Ok(());
         }
         if !self.serves(&manifest) {
-            let bytes = fetch(&self.session, &manifest).await?;
-            self.core.load_published(manifest, bytes).await?;
+            let bytes = fetch(&self.session, &manifest);
+            self.core.load_published(manifest.clone(), bytes).await?;
         }
         self.promoted_unix_nanos.insert(model, promoted_unix_nanos);
         Ok(())

@@ -15,6 +15,7 @@ mod model_thread;
 mod openpi;
 mod owner;
 mod served;
+mod signatures;
 mod task;
 mod zenoh;
 

@@ -1,5 +1,6 @@
 //! A model as it is served, and what is checked before it is.
 
+use crate::signatures::Signatures;
 use crate::task::PlanTask;
 use cpn::checkpoint::{self, Checkpoint, Provenance};
 use cpn::encoder::Precision;
@@ -63,16 +64,28 @@ impl Model {
     /// Reads a checkpoint, from the bytes or from a file in `folder`, and tries it once. Blocks.
     ///
     /// # Errors
-    /// If the file is not there, or for anything wrong with the checkpoint, with the reason in `got`.
-    pub(crate) fn load(folder: &Path, request: LoadModelRequest, computing: Computing) -> Result<Self, Error> {
+    /// If the file is not there or its signature is refused, or for anything wrong with the checkpoint, with the reason in `got`.
+    pub(crate) fn load(
+        folder: &Path,
+        request: LoadModelRequest,
+        signatures: &Signatures,
+        computing: Computing,
+    ) -> Result<Self, Error> {
         let bytes = match request.source {
-            CheckpointSource::Bytes(bytes) => bytes,
-            // One byte more than a checkpoint may have, so that it is refused as too large.
-            CheckpointSource::File(name) => files::read_at_most(&folder.join(&name), checkpoint::MAX_BYTES + 1)
-                .map_err(|e| match e.kind() {
-                    io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", name),
+            CheckpointSource::Bytes(bytes) => {
+                signatures.check_unsigned(&request.model)?;
+                bytes
+            }
+            CheckpointSource::File(name) => {
+                // One byte more than a checkpoint may have, so that it is refused as too large.
+                let read = files::read_at_most(&folder.join(&name), checkpoint::MAX_BYTES + 1);
+                let bytes = read.map_err(|e| match e.kind() {
+                    io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", &name),
                     _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),
-                })?,
+                })?;
+                signatures.check_file(folder, &name, &bytes)?;
+                bytes
+            }
         };
         Self::tried(request.model, 0, read(&bytes)?, computing)
     }

@@ -5,7 +5,9 @@
 use clap::Parser;
 use planner::Config;
 use planner::config::Args;
+use signing::Trust;
 use std::io::Write;
+use std::path::PathBuf;
 use tempfile::NamedTempFile;
 
 fn load(file: &str, arguments: &[&str]) -> anyhow::Result<Config> {
@@ -40,10 +42,33 @@ fn openpi_is_listened_to_where_it_is_said() {
 }
 
 #[test]
+fn trusted_keys_are_a_list_or_one_text() {
+    let none = load("", &[]).unwrap();
+    assert_eq!((none.trust, none.trusted_keys.len()), (None, 0));
+    let expected = ["a.pem", "b/c.pem"].map(PathBuf::from);
+    for (file, arguments) in [
+        ("trusted_keys = ['a.pem', 'b/c.pem']", &[][..]),
+        // As in the environment.
+        ("trusted_keys = 'a.pem,b/c.pem'", &[]),
+        ("trusted_keys = 'x.pem'", &["--trusted-keys", "a.pem,b/c.pem"]),
+        ("", &["--trusted-keys", "a.pem", "--trusted-keys", "b/c.pem"]),
+    ] {
+        assert_eq!(load(file, arguments).unwrap().trusted_keys, expected, "{file}");
+    }
+    for (arguments, expected) in [(&[][..], Trust::Warn), (&["--trust", "enforce"], Trust::Enforce)] {
+        assert_eq!(load("trust = 'warn'", arguments).unwrap().trust, Some(expected));
+    }
+}
+
+#[test]
 fn a_wrong_setting_is_named() {
-    for (file, field) in
-        [("queue_capacity = 0", "queue_capacity"), ("openpi_listen = 8000", "openpi_listen"), ("thread = 1", "thread")]
-    {
+    for (file, field) in [
+        ("queue_capacity = 0", "queue_capacity"),
+        ("openpi_listen = 8000", "openpi_listen"),
+        ("thread = 1", "thread"),
+        ("trust = 'some'", "trust"),
+        ("trusted_keys = 1", "trusted_keys"),
+    ] {
         let error = format!("{:#}", load(file, &[]).unwrap_err());
         assert!(error.contains(field), "{error}");
     }

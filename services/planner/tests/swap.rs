@@ -178,6 +178,7 @@ fn manifest(model: &str, version: u32, bytes: &[u8]) -> CheckpointManifest {
         digest: loaded.digest,
         size_bytes: bytes.len() as u64,
         config_digest: loaded.config_digest,
+        signature_bundle: None,
     }
 }
 

@@ -114,6 +114,18 @@ impl History {
         self.forget_lost_promotions();
     }
 
+    /// Keeps a signature with every version of these weights; false if they have it already.
+    pub(crate) fn sign(&mut self, digest: &str, bundle: &str) -> bool {
+        let mut changed = false;
+        for manifest in self.versions.iter_mut().filter(|manifest| manifest.digest == digest) {
+            if manifest.signature_bundle.as_deref() != Some(bundle) {
+                manifest.signature_bundle = Some(bundle.to_owned());
+                changed = true;
+            }
+        }
+        changed
+    }
+
     /// Promotes the version that was promoted before the one that is; false if there is none.
     pub(crate) fn roll_back(&mut self) -> bool {
         self.promotions.pop();

@@ -34,6 +34,7 @@ mod runs_metrics;
 mod runs_zenoh;
 pub mod sampler;
 pub mod service;
+mod signature;
 pub mod train;
 pub mod verify;
 pub mod versions;

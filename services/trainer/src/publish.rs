@@ -163,14 +163,16 @@ async fn call<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyE
 pub fn table(versions: &[CheckpointVersion]) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
-    table.set_header(["model", "version", "promoted", "bytes", "digest", "configuration", "parents"]);
+    table.set_header(["model", "version", "promoted", "bytes", "digest", "configuration", "parents", "signed"]);
     let short = |digest: &String| digest[..digest.floor_char_boundary(12)].to_owned();
     for CheckpointVersion { manifest, promoted } in versions {
-        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents } = manifest;
+        let CheckpointManifest { model, version, digest, size_bytes, config_digest, parents, signature_bundle } =
+            manifest;
         let parents = parents.iter().map(short).collect::<Vec<_>>().join(" ");
-        let promoted = if *promoted { "yes" } else { "" };
+        let [promoted, signed] = [*promoted, signature_bundle.is_some()].map(|is| if is { "yes" } else { "" });
         let (version, bytes) = (version.to_string(), size_bytes.to_string());
-        table.add_row([model.clone(), version, promoted.into(), bytes, short(digest), short(config_digest), parents]);
+        let (digest, config_digest) = (short(digest), short(config_digest));
+        table.add_row([model.clone(), version, promoted.into(), bytes, digest, config_digest, parents, signed.into()]);
     }
     for column in [1, 3] {
         if let Some(column) = table.column_mut(column) {

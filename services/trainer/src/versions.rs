@@ -1,12 +1,14 @@
 //! The published versions of every model, in the folder that training runs write their checkpoints to.
 //!
-//! `<model>.safetensors` is what a run wrote last; `versions/<model>` is the model's history.
+//! `<model>.safetensors` is what a run wrote last, `<model>.safetensors.sig` its signature, if it has one; `versions/<model>`
+//! is the model's history.
 
 use crate::history::{self, History};
+use crate::signature;
 use anyhow::Context;
 use service_kit::files;
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::num::NonZeroU16;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::PathBuf;
@@ -33,13 +35,17 @@ pub struct Versions {
     _lock: File,
     /// By model, each with a version at least. Held until a change is on disk.
     histories: Mutex<BTreeMap<String, History>>,
-    /// The files that were taken in or refused, by model.
-    seen: Mutex<HashMap<String, Stamp>>,
+    /// The checkpoints that were taken in or refused, each with its signature, by model.
+    seen: Mutex<HashMap<String, (Stamp, Option<Stamp>)>>,
     promoted: watch::Sender<BTreeMap<String, CheckpointAnnouncement>>,
 }
 
 /// Tells apart what a file was before and after it was written: its inode, and when that changed.
 type Stamp = (u64, i64, i64);
+
+fn stamp(metadata: &Metadata) -> Stamp {
+    (metadata.ino(), metadata.ctime(), metadata.ctime_nsec())
+}
 
 impl Versions {
     /// Takes over a folder, which is made if there is none; of each model at least the last `keep` versions will be kept.
@@ -69,8 +75,8 @@ impl Versions {
         self.promoted.subscribe()
     }
 
-    /// Publishes every checkpoint that was written since the last time. One that is faulty is passed over, with its reason
-    /// in the log, until it is written anew.
+    /// Publishes every checkpoint that was written since the last time, and every signature: one that comes after its
+    /// checkpoint is added to the version. What is faulty is passed over, with its reason in the log, until it is written anew.
     ///
     /// # Errors
     /// If the folder cannot be read.
@@ -80,14 +86,16 @@ impl Versions {
             let path = entry?.path();
             // Before the file is read: if it is replaced in between, it is looked at once more.
             let (Some(model), Ok(metadata)) = (history::stem(&path), path.metadata()) else { continue };
-            let stamp = (metadata.ino(), metadata.ctime(), metadata.ctime_nsec());
-            if seen.get(&model) == Some(&stamp) {
+            let signed = signature::path(&path).metadata().ok();
+            let stamps = (stamp(&metadata), signed.as_ref().map(stamp));
+            if seen.get(&model) == Some(&stamps) {
                 continue;
             }
             // One byte more than a checkpoint may have, so that it is refused as too large.
             let bytes = files::read_at_most(&path, cpn::checkpoint::MAX_BYTES + 1)
                 .map_err(|e| Error::invalid("checkpoint", "a file that can be read", e));
-            let published = bytes.and_then(|bytes| self.publish(&model, &bytes));
+            let published =
+                bytes.and_then(|bytes| self.publish_signed(&model, &bytes, signature::beside(&path, &bytes)));
             if let Err(error) = published {
                 warn!(path = %path.display(), %error, "checkpoint not published");
                 if error.code == Code::Internal {
@@ -95,7 +103,7 @@ impl Versions {
                     continue;
                 }
             }
-            seen.insert(model, stamp);
+            seen.insert(model, stamps);
         }
         Ok(())
     }
@@ -105,12 +113,22 @@ impl Versions {
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint or name, with the reason; `INTERNAL` if it cannot be written.
     pub fn publish(&self, model: &str, bytes: &[u8]) -> Result<(), Error> {
+        self.publish_signed(model, bytes, None)
+    }
+
+    /// The same with a signature, which the last version gets too if it is this checkpoint already.
+    fn publish_signed(&self, model: &str, bytes: &[u8], signature: Option<String>) -> Result<(), Error> {
         let checkpoint = cpn::checkpoint::from_bytes(bytes)
             .map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
         let mut histories = self.histories();
         let mut history = histories.get(model).cloned().unwrap_or_default();
         let last = history.manifests().last();
         if last.is_some_and(|last| last.digest == checkpoint.digest) {
+            let digest = checkpoint.digest;
+            if signature.is_some_and(|bundle| history.sign(&digest, &bundle)) {
+                self.store(&mut histories, model, history)?;
+                info!(model, digest, "signature added");
+            }
             return Ok(());
         }
         let manifest = history::valid(CheckpointManifest {
@@ -120,6 +138,7 @@ impl Versions {
             digest: checkpoint.digest,
             size_bytes: bytes.len() as u64,
             config_digest: checkpoint.config_digest,
+            signature_bundle: signature,
         })?;
         let weights = history::weights(&self.folder(model), &manifest.digest);
         files::write_atomically(&weights, bytes).map_err(|e| unwritten(&e))?;
@@ -199,8 +218,20 @@ impl Versions {
         Ok(CheckpointChunkResponse { data })
     }
 
-    /// Makes a change last, then lets it be known; answers what is promoted.
+    /// Makes a promotion last, then lets it be known; answers what is promoted.
     fn commit(
+        &self,
+        histories: &mut BTreeMap<String, History>,
+        model: &str,
+        history: History,
+    ) -> Result<CheckpointManifest, Error> {
+        let manifest = self.store(histories, model, history)?;
+        info!(model, version = manifest.version, digest = manifest.digest, "promoted");
+        Ok(manifest)
+    }
+
+    /// Makes a change last, then lets it be known; answers what is promoted.
+    fn store(
         &self,
         histories: &mut BTreeMap<String, History>,
         model: &str,
@@ -210,7 +241,6 @@ impl Versions {
         history.write(&self.folder(model)).map_err(|e| unwritten(&e))?;
         histories.insert(model.to_owned(), history);
         let manifest = announcement.manifest.clone();
-        info!(model, version = manifest.version, digest = manifest.digest, "promoted");
         self.promoted.send_modify(|promoted| drop(promoted.insert(model.to_owned(), announcement)));
         Ok(manifest)
     }

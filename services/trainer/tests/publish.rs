@@ -3,9 +3,13 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 mod common;
+#[path = "../../planner/tests/common/signed.rs"]
+mod signed;
 
 use common::checkpoint;
 use service_kit::{SessionConfig, files};
+use signed::{bundle, public_key};
+use signing::Trust;
 use std::path::Path;
 use std::process::Output;
 use std::time::Duration;
@@ -33,14 +37,17 @@ async fn start_trainer(folder: &Path, endpoint: &str) -> Service {
 }
 
 async fn start_planner(folder: &Path, name: &str, endpoint: &str) -> planner::Planner {
-    let config = planner::Config {
+    planner::start(planner_config(folder, name, endpoint)).await.unwrap()
+}
+
+fn planner_config(folder: &Path, name: &str, endpoint: &str) -> planner::Config {
+    planner::Config {
         name: name.into(),
         models_dir: folder.join("none"),
         grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() },
         ..planner::Config::default()
-    };
-    planner::start(config).await.unwrap()
+    }
 }
 
 /// Waits until the planner serves a version.
@@ -141,5 +148,46 @@ async fn versions_are_listed_promoted_and_rolled_back_from_the_command_line() {
         assert!(!refused.status.success() && said.contains(reason), "{arguments:?}: {said}");
     }
     planner.shutdown().await.unwrap();
+    trainer.shutdown().await.unwrap();
+}
+
+/// Of two planners, the one that wants signatures serves a version once it is signed, without a further promotion.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_signature_reaches_planners_after_its_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let (folder, endpoint) = (folder.path(), "tcp/127.0.0.1:17463");
+    let keys = folder.join("ours.pub.pem");
+    std::fs::write(&keys, public_key(1)).unwrap();
+    let trainer = start_trainer(folder, endpoint).await;
+    let strict = planner::Config {
+        trust: Some(Trust::Enforce),
+        trusted_keys: vec![keys],
+        ..planner_config(folder, "strict", endpoint)
+    };
+    let (strict, lax) = (planner::start(strict).await.unwrap(), start_planner(folder, "lax", endpoint).await);
+    let sign = |key: u8, seed: u64| {
+        let path = folder.join("checkpoints/cpn.safetensors.sig");
+        files::write_atomically(&path, bundle(key, &checkpoint(seed)).as_bytes()).unwrap();
+    };
+
+    let first = write(folder, 1);
+    sign(1, 1);
+    served(&lax, 1, &first).await;
+    served(&strict, 1, &first).await;
+    let second = write(folder, 2);
+    served(&lax, 2, &second).await;
+    sign(2, 2);
+    // What is written next is announced after that.
+    files::write_atomically(&folder.join("checkpoints/other.safetensors"), &checkpoint(3)).unwrap();
+    served(&lax, 1, &cpn::checkpoint::digest(&checkpoint(3))).await;
+    let models = strict.core().list_models().models;
+    let versions: Vec<_> = models.iter().map(|info| (info.name.as_str(), info.version)).collect();
+    assert_eq!(versions, [("cpn", 1), ("random", 0)], "neither the stranger's nor the unsigned one");
+
+    sign(1, 2);
+    served(&strict, 2, &second).await;
+    for planner in [strict, lax] {
+        planner.shutdown().await.unwrap();
+    }
     trainer.shutdown().await.unwrap();
 }

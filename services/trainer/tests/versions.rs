@@ -3,9 +3,12 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 mod common;
+#[path = "../../planner/tests/common/signed.rs"]
+mod signed;
 
 use common::checkpoint;
 use cpn::archive::{self, Tensors};
+use signed::bundle;
 use std::collections::BTreeSet;
 use std::num::NonZeroU16;
 use std::path::Path;
@@ -81,6 +84,7 @@ fn a_checkpoint_becomes_the_next_version_and_is_promoted() {
             size_bytes: bytes.len() as u64,
             config_digest: loaded.config_digest,
             parents: vec![common::DATA_DIGEST.into()],
+            signature_bundle: None,
         };
         assert_eq!(announced(&versions).manifest, manifest);
         assert_eq!(listed(&versions), ((1..=number).collect(), number));
@@ -317,4 +321,114 @@ fn what_training_runs_write_is_taken_in() {
     write("cpn.safetensors", &checkpoint(1));
     write("upn.safetensors", &checkpoint(3));
     assert_eq!(versions_of(), [("cpn".into(), 1), ("upn".into(), 1), ("upn".into(), 2)]);
+}
+
+/// The signature of each version of the model "cpn".
+fn signatures(versions: &Versions) -> Vec<Option<String>> {
+    let listed = versions.list(ListVersionsRequest { model: Some("cpn".into()) }).unwrap().versions;
+    listed.into_iter().map(|version| version.manifest.signature_bundle).collect()
+}
+
+/// A signature may come before its checkpoint, with it or after it.
+#[test]
+fn a_signature_is_published_with_its_checkpoint() {
+    let folder = TempDir::new().unwrap();
+    let versions = open(&folder, 5);
+    let [weights, signature] = ["cpn.safetensors", "cpn.safetensors.sig"].map(|name| folder.path().join(name));
+    let write = |path: &Path, bytes: &[u8]| service_kit::files::write_atomically(path, bytes).unwrap();
+    let [first, second] = [1, 2].map(|seed| bundle(1, &checkpoint(seed)));
+
+    // After it: the version stays, and is announced again with its signature.
+    write(&weights, &checkpoint(1));
+    versions.take_in().unwrap();
+    let mut watched = versions.promoted();
+    let before = watched.borrow_and_update()["cpn"].clone();
+    assert_eq!(before.manifest.signature_bundle, None);
+    versions.take_in().unwrap();
+    assert!(!watched.has_changed().unwrap());
+    write(&signature, first.as_bytes());
+    versions.take_in().unwrap();
+    let expected = CheckpointManifest { signature_bundle: Some(first.clone()), ..before.manifest };
+    assert!(watched.has_changed().unwrap());
+    assert_eq!(watched.borrow_and_update()["cpn"], CheckpointAnnouncement { manifest: expected, ..before });
+    versions.take_in().unwrap();
+    assert!(!watched.has_changed().unwrap(), "it is nothing new");
+
+    // Before it: that of other weights is passed over until these are there.
+    write(&signature, second.as_bytes());
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [Some(first.clone())]);
+    write(&weights, &checkpoint(2));
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [Some(first.clone()), Some(second.clone())]);
+    // That of the weights before.
+    write(&weights, &checkpoint(3));
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [Some(first.clone()), Some(second.clone()), None]);
+
+    // Another key's takes its place; without a file the version keeps it, and through a restart.
+    let third = bundle(2, &checkpoint(3));
+    for bundle in [bundle(1, &checkpoint(3)), third.clone()] {
+        write(&signature, bundle.as_bytes());
+        versions.take_in().unwrap();
+        assert_eq!(signatures(&versions)[2].as_ref(), Some(&bundle));
+    }
+    std::fs::remove_file(&signature).unwrap();
+    versions.take_in().unwrap();
+    let announced_before = announced(&versions);
+    drop(versions);
+    let versions = open(&folder, 5);
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [Some(first), Some(second), Some(third)]);
+    assert_eq!(announced(&versions), announced_before);
+}
+
+/// A version that was rolled back from gets its signature, and stays where it is.
+#[test]
+fn a_signature_promotes_nothing() {
+    let folder = TempDir::new().unwrap();
+    let versions = open(&folder, 5);
+    let path = folder.path().join("cpn.safetensors");
+    for seed in [1, 2, 1] {
+        std::fs::write(&path, checkpoint(seed)).unwrap();
+        versions.take_in().unwrap();
+    }
+    roll_back(&versions).unwrap();
+    let before = announced(&versions);
+    let first = bundle(1, &checkpoint(1));
+    std::fs::write(folder.path().join("cpn.safetensors.sig"), &first).unwrap();
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [Some(first.clone()), None, Some(first)], "both have these weights");
+    assert_eq!(announced(&versions), before);
+    assert_eq!(listed(&versions), (vec![1, 2, 3], 2));
+}
+
+#[test]
+fn what_is_no_signature_of_the_weights_is_passed_over() {
+    let good = bundle(1, &checkpoint(1));
+    let other = bundle(1, &checkpoint(2));
+    for wrong in ["", "{}", "null", &good[..good.len() - 1], &other, &" ".repeat(70_000)] {
+        let folder = TempDir::new().unwrap();
+        let versions = open(&folder, 5);
+        std::fs::write(folder.path().join("cpn.safetensors.sig"), wrong).unwrap();
+        std::fs::write(folder.path().join("cpn.safetensors"), checkpoint(1)).unwrap();
+        versions.take_in().unwrap();
+        assert_eq!(signatures(&versions), [None], "{wrong:.20}");
+    }
+    let folder = TempDir::new().unwrap();
+    let versions = open(&folder, 5);
+    std::fs::create_dir(folder.path().join("cpn.safetensors.sig")).unwrap();
+    std::fs::write(folder.path().join("cpn.safetensors"), checkpoint(1)).unwrap();
+    versions.take_in().unwrap();
+    assert_eq!(signatures(&versions), [None]);
+}
+
+/// Histories of before there were signatures are read, and those of unsigned versions can be read by who knows none.
+#[test]
+fn an_unsigned_history_says_nothing_of_signatures() {
+    let folder = TempDir::new().unwrap();
+    open(&folder, 5).publish("cpn", &checkpoint(1)).unwrap();
+    let history = std::fs::read_to_string(folder.path().join("versions/cpn/history.json")).unwrap();
+    assert!(history.contains("config_digest") && !history.contains("signature"), "{history}");
+    assert_eq!(signatures(&open(&folder, 5)), [None]);
 }

@@ -124,6 +124,7 @@ fn checkpoints() -> Vec<Example> {
         size_bytes: 9,
         config_digest: digest(),
         parents: vec![digest()],
+        signature_bundle: Some("{}".into()),
     };
     let version = CheckpointVersion { manifest: manifest.clone(), promoted: true };
     vec![
