@@ -1,5 +1,6 @@
 //! How much the model has to do, so that who would wait too long is told at once.
 
+use metrics::gauge;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -7,6 +8,9 @@ use std::time::Duration;
 const WEIGHT: f64 = 0.1;
 /// What is promised is a little longer than what is expected.
 const CAUTION: f64 = 1.5;
+
+/// Metric of the tasks that are not answered yet.
+const QUEUE_DEPTH: &str = "cpn_planner_queue_depth";
 
 /// Tasks that have been accepted and not answered, and what one takes.
 #[derive(Debug, Default)]
@@ -19,6 +23,7 @@ impl Load {
     /// A task has been accepted.
     pub(crate) fn begin(&self) {
         self.tasks.fetch_add(1, Ordering::Relaxed);
+        gauge!(QUEUE_DEPTH).increment(1);
     }
 
     /// Some tasks, done together, took so long.
@@ -32,6 +37,7 @@ impl Load {
     /// A task has been answered, or given up.
     pub(crate) fn end(&self) {
         self.tasks.fetch_sub(1, Ordering::Relaxed);
+        gauge!(QUEUE_DEPTH).decrement(1);
     }
 
     /// Tasks that are not answered yet.
