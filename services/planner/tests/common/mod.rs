@@ -39,6 +39,7 @@ pub struct Fixture {
     pub session: Session,
     pub channel: Channel,
     pub models_dir: TempDir,
+    pub namespace: Option<String>,
 }
 
 impl Fixture {
@@ -60,7 +61,7 @@ impl Fixture {
             name: NAME.into(),
             models_dir: models_dir.path().into(),
             grpc_listen: ([127, 0, 0, 1], 0).into(),
-            session: SessionConfig { namespace, connect, ..SessionConfig::default() },
+            session: SessionConfig { namespace: namespace.clone(), connect, ..SessionConfig::default() },
             ..Config::default()
         };
         configure(&mut config);
@@ -68,7 +69,7 @@ impl Fixture {
         soon(planners.recv_async()).await.unwrap();
         let url = format!("http://{}", planner.grpc_address());
         let channel = Channel::from_shared(url).unwrap().connect().await.unwrap();
-        Self { planner, session, channel, models_dir }
+        Self { planner, session, channel, models_dir, namespace }
     }
 
     /// One client of each transport.
