@@ -6,7 +6,7 @@ import zenoh
 
 from cpn_sim_worker import keys
 from cpn_sim_worker.session import open_session
-from tests.support import HEALTH_COMMAND, StartWorker, client, free_endpoint, router
+from tests.support import HEALTH_COMMAND, READY_SECONDS, StartWorker, client, free_endpoint, router, wait_for
 
 
 def check(*options: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -17,8 +17,10 @@ def check(*options: str, **environment: str) -> subprocess.CompletedProcess[str]
 def test_worker_behind_a_router_is_found() -> None:
     endpoint = free_endpoint()
     environment = {"CPN_MODE": "client", "CPN_CONNECT": endpoint}
-    with open_session(router(endpoint)), open_session(client(endpoint)) as session:
-        token = session.liveliness().declare_token(keys.sim_alive("w0"))
+    key = keys.sim_alive("w0")
+    with open_session(router(endpoint)) as routing, open_session(client(endpoint)) as session:
+        token = session.liveliness().declare_token(key)
+        wait_for(lambda: list(routing.liveliness().get(key, timeout=READY_SECONDS)))
         healthy = check("--worker", "w0", **environment)
         assert (healthy.returncode, healthy.stdout, healthy.stderr) == (0, "", "")
         missing = check("--worker", "w1", **environment)
@@ -26,6 +28,7 @@ def test_worker_behind_a_router_is_found() -> None:
         expected = f"worker w1 is not ready: nobody in the network holds the liveliness token {keys.sim_alive('w1')}\n"
         assert missing.stderr == expected
         token.undeclare()
+        wait_for(lambda: not list(routing.liveliness().get(key, timeout=READY_SECONDS)))
         assert check("--worker", "w0", **environment).returncode == 1
     without_router = check("--worker", "w0", **environment)
     assert without_router.returncode == 1

@@ -286,9 +286,9 @@ def test_worker_is_found_again_after_its_router(simulator: Simulator) -> None:
 @pytest.mark.parametrize("mode", ["client", "peer"])
 def test_second_worker_of_a_name_is_refused(mode: str) -> None:
     endpoint = free_endpoint()
-    with open_session(router(endpoint)), open_session(client(endpoint)) as session:
-        # Beside a router, who holds a name is known at once, by peers too.
+    with open_session(router(endpoint)) as routing, open_session(client(endpoint)) as session:
         token = session.liveliness().declare_token(keys.sim_alive("twin"))
+        wait_for(lambda: list(routing.liveliness().get(keys.sim_alive("twin"), timeout=READY_SECONDS)))
         command = [COMMAND, "serve", "--worker", "twin", "--mode", mode, "--connect", endpoint]
         run = subprocess.run(command, capture_output=True, text=True, check=False)
         assert run.returncode == 1

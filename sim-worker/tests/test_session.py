@@ -227,6 +227,7 @@ def test_answers_that_do_not_come_are_told_apart() -> None:
         with pytest.raises(NotServedError, match="nobody/commit: nobody serves it"):
             commit(asking, "nobody", READY_SECONDS)
         service.declare_queryable(keys.demonstration_commit("silent"), held.append)
+        wait_for(lambda: list(asking.get(keys.demonstration_commit("silent"), timeout=0.1)))
         with pytest.raises(LateError, match=r"silent/commit within 0\.5 s"):
             commit(asking, "silent", 0.5)
         held.clear()
@@ -332,14 +333,15 @@ def test_declarations_outlive_the_router() -> None:
 
 def test_namespaces_are_kept_apart() -> None:
     endpoint = free_endpoint()
-    with (
-        open_session(router(endpoint)),
-        open_session(ZenohConfig(mode="client", connect=(endpoint,), namespace="one")) as one,
-        open_session(ZenohConfig(mode="client", connect=(endpoint,), namespace="two")) as two,
-    ):
+    with ExitStack() as stack:
+        stack.enter_context(open_session(router(endpoint)))
+        one, same, other = (
+            stack.enter_context(open_session(ZenohConfig(mode="client", connect=(endpoint,), namespace=namespace)))
+            for namespace in ("one", "one", "other")
+        )
         token = one.liveliness().declare_token(keys.planner_alive("p"))
-        assert list(one.liveliness().get(keys.planner_alive("p"), timeout=READY_SECONDS))
-        assert not list(two.liveliness().get(keys.planner_alive("p"), timeout=READY_SECONDS))
+        wait_for(lambda: list(same.liveliness().get(keys.planner_alive("p"), timeout=READY_SECONDS)))
+        assert not list(other.liveliness().get(keys.planner_alive("p"), timeout=READY_SECONDS))
         token.undeclare()
 
 

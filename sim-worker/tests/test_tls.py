@@ -80,6 +80,7 @@ def test_members_talk_over_mutual_tls(authority: Authority, endpoint: str) -> No
     ):
         queryable = trainer.declare_queryable(keys.demonstration_commit("e"), answer, complete=True)
         request, response_type = demonstration_pb2.CommitEpisodeRequest(), demonstration_pb2.CommitEpisodeResponse
+        wait_for(lambda: list(worker.get(keys.demonstration_commit("e"), timeout=READY_SECONDS)))
         response = ask(worker, keys.demonstration_commit("e"), request, response_type, READY_SECONDS)
         assert response.missing_steps == [7]
         queryable.undeclare()
