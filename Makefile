@@ -98,6 +98,7 @@ test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library an
 
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo test --workspace --locked --test openpi
+	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness

@@ -18,6 +18,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
+PLANNER = os.environ.get("CPN_PLANNER", str(ROOT / "target/debug/cpn-planner"))
 
 
 def _messages() -> dict[str, Any]:
@@ -50,9 +51,8 @@ class Planner:
 
 @pytest.fixture(scope="session")
 def planner() -> Iterator[Planner]:
-    program = os.environ.get("CPN_PLANNER", str(ROOT / "target/debug/cpn-planner"))
     options = ["--models-dir", str(ROOT / "models"), "--grpc-listen", "127.0.0.1:0", "--openpi-listen", "127.0.0.1:0"]
-    with subprocess.Popen([program, *options], stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([PLANNER, *options], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr
         log = ""
         for line in process.stderr:
