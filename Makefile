@@ -7,11 +7,12 @@ WORKER := sim-worker/.venv
 EXPORT := export/.venv
 BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
+KUBERNETES := tests/kubernetes/.venv
 COMPOSE ?= docker-compose
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-bench fuzz bench-sim bench-train bench-plan lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-bench fuzz bench-sim bench-train bench-plan lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -42,6 +43,10 @@ $(BENCH)/.ready: benches/peers/pyproject.toml benches/peers/uv.lock | $(UV)
 
 $(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock | $(UV)
 	cd tests/openpi && $(UV) sync --quiet --locked
+	touch $@
+
+$(KUBERNETES)/.ready: tests/kubernetes/pyproject.toml tests/kubernetes/uv.lock | $(UV)
+	cd tests/kubernetes && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -101,6 +106,9 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, without one
+	cd tests/kubernetes && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
 	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
@@ -123,13 +131,13 @@ lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cd fuzz && cargo fmt --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
 	cd fuzz && cargo fmt
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) .libtorch
+	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) .libtorch
