@@ -27,17 +27,27 @@ Manifest = dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def manifests(tmp_path_factory: pytest.TempPathFactory) -> list[Manifest]:
-    """What `kubectl apply -k` would send, with empty certificates."""
+def kustomization(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder, with empty certificates."""
     folder = tmp_path_factory.mktemp("kubernetes") / "kubernetes"
     shutil.copytree(KUBERNETES, folder, ignore=shutil.ignore_patterns("certificates"))
     for secret in read(folder / "kustomization.yaml")[0]["secretGenerator"]:
         for file in secret["files"]:
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / file).touch()
+    return folder
+
+
+def built(folder: Path) -> list[Manifest]:
+    """What `kubectl apply -k` would send."""
     build = subprocess.run(["kubectl", "kustomize", str(folder)], check=True, capture_output=True, text=True)
     assert build.stderr == ""
     return list(yaml.safe_load_all(build.stdout))
+
+
+@pytest.fixture(scope="session")
+def manifests(kustomization: Path) -> list[Manifest]:
+    return built(kustomization)
 
 
 @pytest.fixture(scope="session")
@@ -103,7 +113,7 @@ def mounted_files(manifests: list[Manifest], pod: Manifest) -> set[str]:
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_schemas_know_every_field(manifests: list[Manifest], version: str) -> None:
-    for manifest in manifests:
+    for manifest in [*manifests, *read(KUBERNETES / "report.yaml")]:
         kubernetes_validate.validate(manifest, version, strict=True)
 
 
@@ -121,6 +131,16 @@ def test_pods_are_the_services_of_compose(manifests: list[Manifest], compose: Ma
         assert container(pod)["image"] == service["image"]
         limit = container(pod)["resources"]["limits"]["memory"]
         assert limit.removesuffix("i").lower() == service["mem_limit"], name
+
+
+def test_the_documented_kustomization_renames_every_image_of_the_project(kustomization: Path) -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/kubernetes.md").read_text(), re.DOTALL)
+    mine = kustomization.parent / "mine"
+    mine.mkdir()
+    (mine / "kustomization.yaml").write_text(text)
+    images = {container(pod)["image"] for pod in pods(built(mine)).values()}
+    names = ["planner", "trainer", "sim-worker", "evaluator", "prometheus"]
+    assert images == {"eclipse/zenoh:1.10.2", *(f"registry.example/cpn-{name}:1" for name in names)}
 
 
 def test_variables_are_those_of_compose(manifests: list[Manifest], compose: Manifest) -> None:
@@ -206,7 +226,8 @@ def test_probes_ask_as_compose_does(manifests: list[Manifest], compose: Manifest
 def test_pods_have_no_privileges(manifests: list[Manifest]) -> None:
     (namespace,) = of_kind(manifests, "Namespace").values()
     assert namespace["metadata"]["labels"]["pod-security.kubernetes.io/enforce"] == "restricted"
-    for pod in pods(manifests).values():
+    (report,) = read(KUBERNETES / "report.yaml")
+    for pod in [*pods(manifests).values(), report]:
         spec = pod["spec"]
         assert spec["securityContext"] == {
             "runAsNonRoot": True,
@@ -224,7 +245,11 @@ def test_pods_have_no_privileges(manifests: list[Manifest]) -> None:
         assert spec["automountServiceAccountToken"] is False
         # A service named cpn-planner would set CPN_PLANNER_PORT, which a planner refuses.
         assert spec["enableServiceLinks"] is False
+    for pod in pods(manifests).values():
         assert {"name": "tmp", "mountPath": "/tmp"} in container(pod)["volumeMounts"]  # noqa: S108
+    (volume,) = report["spec"]["volumes"]
+    assert volume["persistentVolumeClaim"]["claimName"] in of_kind(manifests, "PersistentVolumeClaim")
+    assert report["metadata"]["namespace"] in of_kind(manifests, "Namespace")
 
 
 def test_the_evaluator_knows_every_planner_and_worker(manifests: list[Manifest], compose: Manifest) -> None:
