@@ -19,8 +19,14 @@ use zenoh::{Session, Wait};
 
 /// Interval between two messages that nobody is connected.
 const REMINDER: Duration = Duration::from_secs(5);
+/// Pause of a client before it tries its routers again.
+const RETRY: Duration = Duration::from_secs(1);
 /// Interval between two looks at the connections.
 const LOOK: Duration = Duration::from_millis(500);
+/// Time in which the first connection is waited for, before a name is taken to be free.
+const FIRST_CONNECTION: Duration = Duration::from_secs(1);
+/// Looks, one after the other, that find a name free before it is.
+const LOOKS: u32 = 2;
 /// Time that the liveliness token of a process that has died may linger: zenoh's lease, and some more.
 const LEASE: Duration = Duration::from_secs(15);
 /// Largest message that is put together from fragments: a request to load a model may carry its checkpoint.
@@ -150,6 +156,8 @@ impl SessionConfig {
             set(&mut zenoh, "mode", json!(mode))?;
         }
         for (key, endpoints) in [("connect/endpoints", &self.connect), ("listen/endpoints", &self.listen)] {
+            // A list may end in a comma.
+            let endpoints: Vec<_> = endpoints.iter().filter(|endpoint| !endpoint.is_empty()).collect();
             if !endpoints.is_empty() {
                 set(&mut zenoh, key, json!(endpoints))?;
             }
@@ -170,6 +178,8 @@ impl SessionConfig {
                 .map_err(|_| anyhow!("password_file {}: expected a password, got none", file.display()))?;
         }
         if let Some(tls) = self.tls()? {
+            // Zenoh would tell of a faulty file only as of a router that does not answer.
+            tls.client()?;
             for (key, file) in [
                 ("root_ca_certificate", &tls.ca),
                 ("listen_certificate", &tls.certificate),
@@ -186,9 +196,19 @@ impl SessionConfig {
         Ok(zenoh)
     }
 
+    /// Whether there is somebody to connect to: endpoints, or whoever is scouted.
+    fn seeks_others(&self) -> bool {
+        let seeks = || {
+            let zenoh = self.zenoh()?;
+            let connect = endpoints(&zenoh, "connect/endpoints", &mode(&zenoh)?)?;
+            anyhow::Ok(!connect.is_empty() || get(&zenoh, "mode")? == json!("client"))
+        };
+        seeks().unwrap_or(true)
+    }
+
     /// Refuses endpoints that listen beyond the loopback interface in plain text, and a client without a router.
     fn check_endpoints(&self, zenoh: &zenoh::Config) -> anyhow::Result<()> {
-        let mode = get(zenoh, "mode")?.as_str().unwrap_or("peer").to_owned();
+        let mode = mode(zenoh)?;
         if mode == "client" && endpoints(zenoh, "connect/endpoints", &mode)?.is_empty() {
             let scouts = get(zenoh, "scouting/multicast/enabled")? == json!(true);
             ensure!(scouts, "connect: expected the endpoint of a router, as the mode is client, got none");
@@ -213,7 +233,8 @@ fn defaults() -> anyhow::Result<zenoh::Config> {
     set(&mut zenoh, "mode", json!("peer"))?;
     set(&mut zenoh, "scouting/multicast/enabled", json!(false))?;
     set(&mut zenoh, "scouting/gossip/enabled", json!(true))?;
-    set(&mut zenoh, "connect/timeout_ms", json!(-1))?;
+    // A client that waited by itself would try its first endpoint for ever, and no other.
+    set(&mut zenoh, "connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 0}))?;
     set(&mut zenoh, "connect/exit_on_failure", json!(false))?;
     set(
         &mut zenoh,
@@ -233,6 +254,10 @@ fn set(config: &mut zenoh::Config, key: &str, value: Value) -> anyhow::Result<()
 fn get(config: &zenoh::Config, key: &str) -> anyhow::Result<Value> {
     let text = config.get_json(key).map_err(|e| anyhow!("zenoh {key}: {e}"))?;
     serde_json::from_str(&text).with_context(|| format!("zenoh {key}"))
+}
+
+fn mode(config: &zenoh::Config) -> anyhow::Result<String> {
+    Ok(get(config, "mode")?.as_str().unwrap_or("peer").to_owned())
 }
 
 /// The endpoints of a mode: zenoh holds one list for all modes, or one for each.
@@ -258,10 +283,19 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
 /// interface in plain text.
 pub async fn open(config: &SessionConfig) -> anyhow::Result<Session> {
     let zenoh = config.zenoh()?;
-    let reached = endpoints(&zenoh, "connect/endpoints", get(&zenoh, "mode")?.as_str().unwrap_or("peer"))?.join(", ");
-    // Zenoh blocks until the router is there, in a single poll: on a thread of its own, nobody else waits with it.
+    let reached = endpoints(&zenoh, "connect/endpoints", &mode(&zenoh)?)?.join(", ");
+    let patient = mode(&zenoh)? == "client";
+    // Zenoh blocks while it connects, in a single poll: on a thread of its own, nobody else waits with it.
     let (sender, mut opened) = oneshot::channel();
-    let open = move || drop(sender.send(zenoh::open(zenoh).wait()));
+    let open = move || {
+        loop {
+            let session = zenoh::open(zenoh.clone()).wait();
+            if session.is_ok() || !patient || sender.is_closed() {
+                return drop(sender.send(session));
+            }
+            std::thread::sleep(RETRY);
+        }
+    };
     std::thread::Builder::new().name("zenoh-open".into()).spawn(open)?;
     let mut reminder = interval(REMINDER);
     reminder.tick().await;
@@ -290,7 +324,7 @@ impl Connection {
     /// Follows a session: warns every few seconds while nobody is connected, and keeps the gauge `cpn_zenoh_connected`.
     pub fn follow(session: &Session, config: &SessionConfig) -> Self {
         let (told, connected) = watch::channel(true);
-        let (session, alone) = (session.clone(), config.connect.is_empty());
+        let (session, alone) = (session.clone(), !config.seeks_others());
         let task = AbortOnDropHandle::new(tokio::spawn(async move {
             let mut look = interval(LOOK);
             look.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -320,27 +354,41 @@ impl Connection {
     }
 }
 
-/// Waits until nobody holds a liveliness token: that of a process that was killed lingers for a while.
+/// Waits until nobody holds a liveliness token: that of a process that was killed lingers for a while. Two processes that start
+/// in the same moment are not told apart.
 ///
 /// # Errors
 /// If somebody holds it for longer than zenoh's lease: two services of one name would each get a part of the requests.
 pub async fn claim(session: &Session, config: &SessionConfig, token: &OwnedKeyExpr) -> anyhow::Result<()> {
-    let start = Instant::now();
-    // Before the first connection nobody else can be seen.
-    while !config.connect.is_empty() && !is_connected(session).await && start.elapsed() < Duration::from_secs(1) {
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-    let mut waiting = false;
+    let (start, seeks) = (Instant::now(), config.seeks_others());
+    let (mut free, mut waiting) = (0, false);
     loop {
-        let holders = session.liveliness().get(token).timeout(Duration::from_secs(2)).await.map_err(|e| anyhow!(e))?;
-        if holders.recv_async().await.is_err() {
+        // Before a connection nobody can be seen; nor, for a moment, through a router that was just restarted.
+        let connected = !seeks || is_connected(session).await;
+        let held = is_held(session, token).await?;
+        free = if held { 0 } else { free + 1 };
+        let unseen = !connected && start.elapsed() < FIRST_CONNECTION;
+        if !seeks && !held || free >= LOOKS && !unseen {
             return Ok(());
         }
-        ensure!(start.elapsed() < LEASE, "name: expected one that no running service has, got that of {token}");
-        if !waiting {
+        if held && !waiting {
             warn!(%token, "a service of this name is running or has just died; waiting for it to go");
             waiting = true;
         }
-        tokio::time::sleep(Duration::from_millis(500)).await;
+        ensure!(
+            start.elapsed() < LEASE || !held,
+            "name: expected one that no running service has, got that of {token}"
+        );
+        tokio::time::sleep(LOOK).await;
     }
+}
+
+async fn is_held(session: &Session, token: &OwnedKeyExpr) -> anyhow::Result<bool> {
+    let holders = session.liveliness().get(token).timeout(Duration::from_secs(2)).await.map_err(|e| anyhow!(e))?;
+    while let Ok(holder) = holders.recv_async().await {
+        if holder.result().is_ok() {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }

@@ -31,7 +31,8 @@ pub struct Telemetry(Option<SdkTracerProvider>);
 pub fn init(service: &'static str) -> anyhow::Result<Telemetry> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
     let logs = tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal());
-    let provider = env::var_os(ENDPOINT).map(|_| provider(service)).transpose()?;
+    let provider =
+        env::var_os(ENDPOINT).filter(|endpoint| !endpoint.is_empty()).map(|_| provider(service)).transpose()?;
     let traces = provider.as_ref().map(|provider| {
         global::set_text_map_propagator(TraceContextPropagator::new());
         let targets = TRACED.map(|target| (target, tracing_subscriber::filter::LevelFilter::DEBUG));

@@ -70,7 +70,7 @@ enum Command {
 }
 
 fn main() -> anyhow::Result<()> {
-    let Cli { folder: Folder { dir, days }, command } = Cli::parse();
+    let Cli { folder: Folder { dir, days }, command } = service_kit::config::parse();
     let mut authority = Authority::open(&dir, days)?;
     match command {
         Command::Init { host, namespace } => {

@@ -1,14 +1,13 @@
 //! `cpn-eval`: measures first-attempt success, reports it, and replays its episodes.
 
 use anyhow::Context;
-use clap::Parser;
 use evaluator::{Cli, Command, Summary};
 use std::process::ExitCode;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let _telemetry = service_kit::telemetry::init("cpn-eval")?;
-    match Cli::parse().command {
+    match service_kit::config::parse::<Cli>().command {
         Command::Run(args) => tell(&evaluator::run(&args).await?, args.json),
         Command::Report(args) => tell(&evaluator::report(&args.out)?, args.json),
         Command::Replay(args) => {

@@ -1,12 +1,11 @@
 //! The planner's process.
 
-use clap::Parser;
 use planner::config::{Args, Config};
 use service_kit::{config, shutdown, telemetry};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
-    let args = Args::parse();
+    let args: Args = config::parse();
     let _telemetry = telemetry::init("cpn-planner")?;
     let config: Config = config::load("CPN_PLANNER_", args.config.as_deref(), &args)?;
     let planner = planner::start(config).await?;

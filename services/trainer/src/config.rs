@@ -3,13 +3,29 @@
 use anyhow::Context;
 use cpn::{ModelConfig, Preset, Recipe, Training};
 use figment::Figment;
-use figment::providers::{Env, Format, Serialized, Toml};
+use figment::providers::{Format, Serialized, Toml};
 use figment::value::Value;
 use serde::{Deserialize, Serialize};
+use service_kit::config;
 use std::path::{Path, PathBuf};
 
 /// How the names of environment variables begin.
 const PREFIX: &str = "CPN_TRAIN_";
+/// Settings that are text, whatever they look like.
+const TEXTS: [&str; 4] = ["preset", "dataset", "out", "run_dir"];
+/// Settings of a run, by their names.
+const FIELDS: [&str; 10] = [
+    "preset",
+    "model",
+    "training",
+    "dataset",
+    "out",
+    "hold_out",
+    "seed",
+    "threads",
+    "save_interval_seconds",
+    "run_dir",
+];
 
 /// Valid settings of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -56,6 +72,15 @@ impl From<Preset> for Config {
     }
 }
 
+/// The value of a setting that is written as text. What lies below `model` and `training` says its type itself, since it may
+/// be of one kind or another; the others are told by their names.
+fn value(key: &str, text: &str) -> Value {
+    if TEXTS.contains(&key) {
+        return Value::from(text);
+    }
+    text.parse().unwrap_or_else(|never| match never {})
+}
+
 impl Config {
     /// Reads settings in layers: `changes`, each `key=value`, over what was typed over the environment over a file over the
     /// preset, which any of them may name.
@@ -67,11 +92,13 @@ impl Config {
         if let Some(file) = file {
             layers = layers.merge(Toml::file_exact(file));
         }
-        layers = layers.merge(Env::prefixed(PREFIX).split("__")).merge(Serialized::defaults(arguments));
+        for variable in config::variables(PREFIX, &FIELDS, value, config::environment())? {
+            layers = layers.merge(variable);
+        }
+        layers = layers.merge(Serialized::defaults(arguments));
         for change in changes {
-            let (key, value) = change.split_once('=').with_context(|| format!("expected key=value, got {change:?}"))?;
-            let value: Value = value.parse().with_context(|| change.clone())?;
-            layers = layers.merge((key, value));
+            let (key, text) = change.split_once('=').with_context(|| format!("expected key=value, got {change:?}"))?;
+            layers = layers.merge((key, value(key, text)));
         }
         Self::over_preset(layers)
     }

@@ -4,7 +4,6 @@
 mod cli;
 
 use anyhow::{anyhow, bail, ensure};
-use clap::Parser;
 use cli::{
     Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, StartArgs, StopArgs,
     TrainerArgs, VerifyArgs, VersionsArgs, WatchArgs,
@@ -28,7 +27,7 @@ use zenoh::Session;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
-    let cli = Cli::parse();
+    let cli: Cli = config::parse();
     let _telemetry = telemetry::init("cpn-trainer")?;
     match cli.command {
         Command::Serve(arguments) => {

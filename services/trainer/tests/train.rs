@@ -148,6 +148,8 @@ fn settings_come_in_layers_over_a_preset() {
     assert_eq!((config.model.updates, config.model.encoder.latent()), (3, 32));
     assert_eq!(config.training.goals, GoalSampling::Hindsight);
 
+    assert_eq!(load(&["dataset=2024"]).unwrap().dataset, Path::new("2024"));
+
     let refused = |change: &str| format!("{:#}", load(&[change]).unwrap_err());
     assert!(refused("training.epoch=7").contains("unknown field"), "{}", refused("training.epoch=7"));
     assert_eq!(refused("training.batch_size=0"), "training.batch_size: expected 1 to 65536, got 0");

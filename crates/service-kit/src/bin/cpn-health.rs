@@ -37,7 +37,7 @@ struct Args {
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> anyhow::Result<()> {
-    let args = Args::parse();
+    let args: Args = service_kit::config::parse();
     let timeout = Duration::from_secs(args.timeout_secs);
     let status = tokio::time::timeout(timeout, ask(args)).await.context("no answer in time")??;
     ensure!(status == ServingStatus::Serving, "expected SERVING, got {}", status.as_str_name());
