@@ -12,7 +12,7 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, Sleep, sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
@@ -22,6 +22,9 @@ use tracing::warn;
 
 /// Time that a client has for its TLS handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time that a client has for its first byte, and then from one to the next: what is served here asks silent clients for a
+/// sign of life more often than that.
+const SILENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(60)];
 /// Pause after the system has refused a connection, as when file descriptors are used up.
 const PAUSE: Duration = Duration::from_millis(200);
 
@@ -115,8 +118,9 @@ async fn accept(
             match shake_hands(stream, acceptor).await {
                 Ok((stream, certificate)) => {
                     let peer = Peer { address, certificate };
+                    let (patience, last_read) = (Box::pin(sleep(SILENCE[0])), None);
                     // The listener may have ended.
-                    let _ = sender.send(Connection { stream, peer, _place: place }).await;
+                    let _ = sender.send(Connection { stream, peer, patience, last_read, _place: place }).await;
                 }
                 Err(error) => {
                     warn!(listener = name, client = %address, %error, "a TLS handshake failed");
@@ -143,11 +147,14 @@ async fn shake_hands(stream: TcpStream, acceptor: Option<TlsAcceptor>) -> std::i
     Ok((Either::Right(Box::new(stream)), name))
 }
 
-/// A connection to a client. Its place is free again when it is dropped.
+/// A connection to a client, which ends in an error when the client says nothing for too long. Its place is free again
+/// when it is dropped.
 #[derive(Debug)]
 pub struct Connection {
     stream: Stream,
     peer: Peer,
+    patience: Pin<Box<Sleep>>,
+    last_read: Option<Instant>,
     _place: OwnedSemaphorePermit,
 }
 
@@ -172,7 +179,30 @@ impl AsyncRead for Connection {
         context: &mut Context<'_>,
         to: &mut ReadBuf<'_>,
     ) -> Poll<std::io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(context, to)
+        let before = to.filled().len();
+        match Pin::new(&mut self.stream).poll_read(context, to) {
+            Poll::Pending => self.poll_silence(context),
+            ready => {
+                if to.filled().len() > before {
+                    self.last_read = Some(Instant::now());
+                }
+                ready
+            }
+        }
+    }
+}
+
+impl Connection {
+    /// Pending until the client has been silent for too long.
+    fn poll_silence(&mut self, context: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+        while self.patience.as_mut().poll(context).is_ready() {
+            let until = self.last_read.map(|last_read| last_read + SILENCE[1]);
+            match until.filter(|until| *until > Instant::now()) {
+                Some(until) => self.patience.as_mut().reset(until),
+                None => return Poll::Ready(Err(std::io::ErrorKind::TimedOut.into())),
+            }
+        }
+        Poll::Pending
     }
 }
 
