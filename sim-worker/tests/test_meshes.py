@@ -1,9 +1,16 @@
 # pyright: reportAttributeAccessIssue=false
+import os
+import re
+import resource
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cpn_sim_worker import meshes
 from cpn_sim_worker.meshes import Decimation, decimated
@@ -26,12 +33,42 @@ SPHERES = f"""
   </worldbody>
 </mujoco>
 """
+MESH_ARRAYS = ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal")
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(meshes, "user_cache_path", lambda _: tmp_path)
-    return tmp_path / "meshes"
+def cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    # Not pytest's own folder, which is closed to the other user of `unprivileged`.
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o777)  # noqa: S103
+        monkeypatch.setenv("XDG_CACHE_HOME", folder)
+        yield Path(folder) / "cpn" / "meshes"
+
+
+@pytest.fixture
+def unprivileged() -> Iterator[None]:
+    """A user that permissions count for, even where tests run as root."""
+    if privileged := os.geteuid() == 0:
+        os.seteuid(65534)
+    yield
+    if privileged:
+        os.seteuid(0)
+
+
+def decimate() -> dict[str, NDArray[Any]]:
+    light = decimated(mujoco.MjModel.from_xml_string(SPHERES), Decimation(500))
+    return {name: getattr(light, name).copy() for name in MESH_ARRAYS}
+
+
+def assert_decimated_anew(caplog: pytest.LogCaptureFixture, *warnings: str) -> None:
+    """The meshes are right, and the log names each file and fault, once."""
+    caplog.clear()
+    for _ in range(2):
+        meshes = decimate()
+        assert 400 <= meshes["mesh_facenum"][0] <= 500
+    assert len(caplog.messages) == len(warnings)
+    for message, warning in zip(caplog.messages, warnings, strict=True):
+        assert re.search(warning, message), message
 
 
 def test_large_meshes_get_fewer_faces_on_the_same_surface() -> None:
@@ -71,7 +108,143 @@ def test_a_mesh_is_decimated_once(cache: Path, monkeypatch: pytest.MonkeyPatch, 
     assert len(list(cache.iterdir())) == 1
     monkeypatch.setattr(meshes.fast_simplification, "simplify", None)
     again = decimated(model, Decimation(500))
-    for name in ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal"):
+    for name in MESH_ARRAYS:
         assert np.array_equal(getattr(first, name), getattr(again, name)), name
     with pytest.raises(TypeError):
         decimated(model, change)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def rewrite(change: Callable[[dict[str, NDArray[Any]]], object]) -> Callable[[Path], None]:
+    """Another file that is whole, with something in it that is not."""
+
+    def spoil(path: Path) -> None:
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        change(arrays)
+        with path.open("wb") as file:
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "fault"),
+    [
+        (lambda path: path.write_bytes(b""), "EOFError"),
+        (cut, "BadZipFile"),
+        (flip, "BadZipFile|zlib|error"),
+        (lambda path: path.write_bytes(b"\x93NUMPY\x01\x00"), "ValueError|EOFError"),
+        (rewrite(lambda arrays: arrays.pop("corners")), "KeyError: .*corners"),
+        (rewrite(lambda arrays: arrays.update(faces=arrays["faces"] + 10_000)), "faces: expected numbers from 0 to"),
+        (rewrite(lambda arrays: arrays.update(faces=arrays["faces"] - 10_000)), "faces: expected numbers from 0 to"),
+        (rewrite(lambda arrays: arrays.update(vertices=arrays["vertices"] * np.inf)), "vertices: expected numbers"),
+        (
+            rewrite(lambda arrays: arrays.update(vertices=arrays["vertices"][:, :2])),
+            r"vertices: expected float32 \[1 to",
+        ),
+        (rewrite(lambda arrays: arrays.update(corners=arrays["corners"][1:])), "corners: expected .* as many as faces"),
+    ],
+)
+def test_a_damaged_file_is_replaced(
+    cache: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[Path], object], fault: str
+) -> None:
+    expected = decimate()
+    (path,) = cache.iterdir()
+    whole = path.read_bytes()
+    spoil(path)
+    assert_decimated_anew(caplog, f"{path} cannot be read: .*({fault}).*; meshes are decimated anew")
+    assert path.read_bytes() == whole
+    assert list(cache.iterdir()) == [path]
+    assert all(np.array_equal(array, expected[name]) for name, array in decimate().items())
+
+
+@pytest.mark.usefixtures("unprivileged")
+def test_a_file_of_another_user_is_replaced(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    decimate()
+    (path,) = cache.iterdir()
+    path.chmod(0)
+    assert_decimated_anew(caplog, f"{path} cannot be read: Permission denied")
+    assert path.read_bytes()
+
+
+@pytest.mark.usefixtures("unprivileged")
+def test_a_folder_of_another_user_is_not_needed(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    decimate()
+    (path,) = cache.iterdir()
+    path.chmod(0)
+    cache.chmod(0o555)
+    denied = "Permission denied; meshes are decimated anew"
+    assert_decimated_anew(caplog, f"{path} cannot be read: {denied}", f"{path} cannot be written: {denied}")
+    cache.chmod(0)
+    assert_decimated_anew(caplog)
+    cache.chmod(0o755)
+
+
+def test_a_cache_can_be_shared(cache: Path) -> None:
+    umask = os.umask(0o022)
+    try:
+        decimate()
+    finally:
+        os.umask(umask)
+    (path,) = cache.iterdir()
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_a_full_file_system_keeps_nothing(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """No byte more fits, and no torn file stays."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        assert_decimated_anew(caplog, f"{cache}/.*npz cannot be written: File too large")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(cache.iterdir()) == []
+
+
+@pytest.mark.parametrize("place", ["cpn", "cpn/meshes"])
+def test_something_else_in_the_place_of_the_folder(cache: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+    path = cache.parents[1] / place
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("mine")
+    read, write = (f"{cache}/.*npz cannot be {action}: " for action in ("read", "written"))
+    assert_decimated_anew(caplog, f"{read}Not a directory", f"{write}(Not a directory|File exists)")
+    assert path.read_text() == "mine"
+
+
+def test_something_else_in_the_place_of_a_file(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    decimate()
+    (path,) = cache.iterdir()
+    path.unlink()
+    os.mkfifo(path)
+    # Nobody writes to the pipe: reading would never end.
+    assert_decimated_anew(caplog, f"{path} cannot be read: ValueError: expected a file")
+    assert path.is_file()
+
+    path.unlink()
+    path.mkdir()
+    decimate()
+    assert list(cache.iterdir()) == [path]
+
+
+def test_nobody_needs_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.chdir(tmp_path)
+    # As in a container whose user its list of users does not have.
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    unused = "cpn/meshes cannot be used: .* set an absolute HOME or XDG variable; meshes are decimated anew"
+    assert_decimated_anew(caplog, unused)
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setenv("HOME", "")
+    assert_decimated_anew(caplog)
+    assert list(tmp_path.iterdir()) == []

@@ -9,18 +9,15 @@ A software renderer spends its time on vertices, and Sawyer's arm has more faces
 import copy
 import hashlib
 import json
-import os
-import tempfile
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import fast_simplification
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from platformdirs import user_cache_path
 from scipy.spatial import KDTree
 
+from cpn_sim_worker.mesh_cache import Bounds, Mesh, decimate_once
 from cpn_sim_worker.render_spec import installed_version
 
 LIBRARIES = ("fast-simplification", "numpy", "scipy")
@@ -43,18 +40,6 @@ class Decimation:
     distance_weight: float = 0.5
     """What an original corner loses by being an edge away, where one whose normal is at right angles to the new face's
     loses 1."""
-
-
-@dataclass(frozen=True)
-class _Mesh:
-    """A mesh in its own frame, as MuJoCo lays it out."""
-
-    vertices: NDArray[np.float32]
-    """[V, 3]."""
-    faces: NDArray[np.int32]
-    """[F, 3], into the vertices."""
-    corners: NDArray[np.int32]
-    """[F, 3], the corner of the original mesh, 0 to 3 F', whose normal and texture each corner takes."""
 
 
 def decimated(model: mujoco.MjModel, decimation: Decimation) -> mujoco.MjModel:
@@ -92,21 +77,19 @@ def _range(first: int, count: int) -> slice:
 
 def _decimate(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], decimation: Decimation
-) -> _Mesh:
+) -> Mesh:
     """Decimates a mesh of vertices [V, 3], faces [F, 3] and corner normals [F, 3, 3], or finds it in the cache."""
     versions = {package: installed_version(package) for package in LIBRARIES}
     digest = hashlib.sha256(json.dumps([asdict(decimation), versions]).encode())
     for array in (vertices, faces, normals):
         digest.update(array.tobytes())
-    path = user_cache_path("cpn") / "meshes" / f"{digest.hexdigest()}.npz"
-    if path.exists():
-        with np.load(path, allow_pickle=False) as archive:
-            return _Mesh(archive["vertices"], archive["faces"], archive["corners"])
-    new_vertices, new_faces = _simplify(*_merge_equal_vertices(vertices, faces), decimation)
-    corners = _nearest_corners(new_vertices, new_faces, vertices, faces, normals, decimation)
-    mesh = _Mesh(new_vertices, new_faces, corners)
-    _save(path, mesh)
-    return mesh
+
+    def decimate() -> Mesh:
+        new_vertices, new_faces = _simplify(*_merge_equal_vertices(vertices, faces), decimation)
+        corners = _nearest_corners(new_vertices, new_faces, vertices, faces, normals, decimation)
+        return Mesh(new_vertices, new_faces, corners)
+
+    return decimate_once(digest.hexdigest(), Bounds(len(vertices), decimation.max_faces, normals.size // 3), decimate)
 
 
 def _merge_equal_vertices(
@@ -162,11 +145,3 @@ def _nearest_corners(
     alignment = np.einsum("fckx,fx->fck", normals.reshape(-1, 3)[candidates], face_normals)
     best = np.argmax(alignment - decimation.distance_weight * distances / edge, axis=-1, keepdims=True)
     return np.take_along_axis(candidates, best, axis=-1)[..., 0].astype(np.int32)
-
-
-def _save(path: Path, mesh: _Mesh) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Several workers may decimate the same mesh at once: each writes its own file, and the last one stays.
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        np.savez(file, vertices=mesh.vertices, faces=mesh.faces, corners=mesh.corners)
-    os.replace(file.name, path)
