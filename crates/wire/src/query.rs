@@ -118,8 +118,17 @@ pub fn traceparent(query: &Query) -> Option<String> {
 /// # Errors
 /// If zenoh cannot send it.
 pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Result<()> {
+    reply_as(query, query.key_expr(), result)
+}
+
+/// Answers a query as the service at `key`, which a query to many has selected: answers under one key would be taken for
+/// versions of the same, of which the asker sees the last only.
+///
+/// # Errors
+/// If zenoh cannot send it.
+pub fn reply_as<R: Message>(query: &Query, key: &keyexpr, result: Result<R, Error>) -> zenoh::Result<()> {
     match result {
-        Ok(response) => reply_at(query, query.key_expr(), response),
+        Ok(response) => reply_at(query, key, response),
         Err(error) => refuse(query, error),
     }
 }

@@ -135,7 +135,9 @@ impl Requests {
     /// answer: a client that is alone would wait for every thread that had to be woken in between.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
         let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
+        let own = Arc::new(key.clone());
         let callback = move |query: Query| {
+            let own = Arc::clone(&own);
             let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
             let deadline = request.as_ref().ok().and_then(|request| request.deadline);
             // The model's thread and the clock both want to answer; the first does.
@@ -143,7 +145,7 @@ impl Requests {
             let answer = move |plan: Answer| {
                 let waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner).take();
                 if let Some((query, _in_flight)) = waiting {
-                    reply(&query, plan);
+                    reply(&query, &own, plan);
                 }
             };
             let clock = deadline.map(|deadline| {
@@ -176,16 +178,17 @@ impl Requests {
         let Self { core, places, capacity, tasks, runtime, .. } = self;
         let (core, places, capacity) = (core.clone(), Arc::clone(places), *capacity);
         let (tasks, runtime) = (tasks.clone(), runtime.clone());
+        let own = Arc::new(key.clone());
         let callback = move |query: Query| {
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
-            let span = request_span(&query);
+            let (span, own) = (request_span(&query), Arc::clone(&own));
             let answer = async move {
                 let result = match (&place, query::request(&query)) {
                     (Err(_), _) => Err(queue_full(capacity)),
                     (Ok(_), Err(error)) => Err(error),
                     (Ok(_), Ok(request)) => serve(core, request).await,
                 };
-                reply(&query, result);
+                reply(&query, &own, result);
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
@@ -200,8 +203,8 @@ fn request_span(query: &Query) -> Span {
     span
 }
 
-fn reply<R: Message>(query: &Query, answer: Result<R, Error>) {
-    if let Err(error) = query::reply(query, answer) {
+fn reply<R: Message>(query: &Query, own: &OwnedKeyExpr, answer: Result<R, Error>) {
+    if let Err(error) = query::reply_as(query, own, answer) {
         warn!(%error, key = %query.key_expr(), "answer not sent");
     }
 }

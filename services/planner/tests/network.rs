@@ -94,6 +94,36 @@ async fn health_tells_of_the_router_and_the_planner_joins_whenever_it_comes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn all_planners_answer_a_query_to_all_each_under_its_own_key() {
+    let endpoint = format!("tcp/{}", free_address());
+    let _router = router(&endpoint).await;
+    let models = tempfile::tempdir().unwrap();
+    let mut planners = Vec::new();
+    for name in ["p0", "p1"] {
+        let config = Config {
+            name: name.into(),
+            models_dir: models.path().into(),
+            grpc_listen: ([127, 0, 0, 1], 0).into(),
+            session: client(&endpoint),
+            ..Config::default()
+        };
+        planners.push(planner::start(config).await.unwrap());
+    }
+    let asking = service_kit::session::open(&client(&endpoint)).await.unwrap();
+    let key = key::planner_list_models("*").unwrap();
+    // As any client asks, without a word of how answers are to be put together.
+    let replies = asking.get(&key).payload(wire::encode(ListModelsRequest)).timeout(TIMEOUT).await.unwrap();
+    let mut keys = Vec::new();
+    while let Ok(reply) = soon(replies.recv_async()).await {
+        let sample = reply.into_result().unwrap();
+        wire::decode::<ListModelsResponse>(&sample.payload().to_bytes()).unwrap();
+        keys.push(sample.key_expr().to_string());
+    }
+    keys.sort();
+    assert_eq!(keys, ["p0", "p1"].map(|name| key::planner_list_models(name).unwrap().to_string()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn zenohs_own_file_and_passwords_are_heeded() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| {

@@ -28,25 +28,26 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
     let key = key::trainer_start_run(name)?;
     ensure!(!key.is_wild(), "name: expected that of one trainer, got {name:?}");
     let zenoh = |e: zenoh::Error| anyhow!(e);
-    let core = runs.clone();
+    let [start_key, stop_key, list_key] = [key, key::trainer_stop_run(name)?, key::trainer_list_runs(name)?];
+    let (core, own) = (runs.clone(), start_key.clone());
     let start = move |query: &Query| {
         let answer = query::request(query).and_then(|request: StartRunRequest| core.start(&request));
-        query::reply(query, answer.map(|run| StartRunResponse { run }))
+        query::reply_as(query, &own, answer.map(|run| StartRunResponse { run }))
     };
-    let (core, runtime) = (runs.clone(), Handle::current());
+    let (core, own, runtime) = (runs.clone(), stop_key.clone(), Handle::current());
     let stop = move |query: &Query| {
         let stop = |request: StopRunRequest| runtime.block_on(core.stop(&request.name));
-        query::reply(query, query::request(query).and_then(stop).map(|run| StopRunResponse { run }))
+        query::reply_as(query, &own, query::request(query).and_then(stop).map(|run| StopRunResponse { run }))
     };
-    let core = runs.clone();
+    let (core, own) = (runs.clone(), list_key.clone());
     let list = move |query: &Query| {
         let answer = query::request(query).map(|_: ListRunsRequest| ListRunsResponse { runs: core.list() });
-        query::reply(query, answer)
+        query::reply_as(query, &own, answer)
     };
     let queryables = [
-        serve(session, key, start).await.map_err(zenoh)?,
-        serve(session, key::trainer_stop_run(name)?, stop).await.map_err(zenoh)?,
-        serve(session, key::trainer_list_runs(name)?, list).await.map_err(zenoh)?,
+        serve(session, start_key, start).await.map_err(zenoh)?,
+        serve(session, stop_key, stop).await.map_err(zenoh)?,
+        serve(session, list_key, list).await.map_err(zenoh)?,
     ];
     let publisher = AbortOnDropHandle::new(tokio::spawn(publish(session.clone(), runs.clone())));
     Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
