@@ -12,7 +12,7 @@ import zenoh
 
 from cpn.v1 import demonstration_pb2, types_pb2
 from cpn_sim_worker import keys
-from cpn_sim_worker.demonstrate import DemonstrateConfig
+from cpn_sim_worker.options import DemonstrateConfig
 from cpn_sim_worker.scene import Transition
 from cpn_sim_worker.session import open_session
 from cpn_sim_worker.simulator import Simulator

@@ -9,11 +9,13 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 import zenoh
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.episode import EpisodeRunner, _Episode
-from cpn_sim_worker.server import QUEUE_LENGTH, NameTakenError, ServeConfig, SimServer, claim_name
+from cpn_sim_worker.options import MAX_STEPS, ServeConfig
+from cpn_sim_worker.server import QUEUE_LENGTH, NameTakenError, SimServer, claim_name
 from cpn_sim_worker.session import StoppedError, UnavailableError, ZenohConfig, ask, is_connected, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
@@ -356,3 +358,7 @@ def test_name_is_not_free_for_the_reason_that_the_router_is_lost() -> None:
 def test_configuration_at_fault_is_refused(options: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ServeConfig(**options)  # pyright: ignore[reportArgumentType]
+
+
+def test_no_task_refuses_as_many_steps() -> None:
+    assert SawyerXYZEnv.max_path_length == MAX_STEPS

@@ -7,8 +7,9 @@ from typing import Annotated
 import tyro
 import zenoh
 
-from cpn_sim_worker.demonstrate import DemonstrateConfig, demonstrate
-from cpn_sim_worker.server import ServeConfig, serve
+from cpn_sim_worker.opengl import OpenGLError, load_mujoco
+from cpn_sim_worker.options import DemonstrateConfig, ServeConfig
+from cpn_sim_worker.server import serve
 from cpn_sim_worker.session import ConfigError
 
 Serve = Annotated[ServeConfig, tyro.conf.subcommand("serve")]
@@ -25,6 +26,10 @@ def main() -> None:
             case ServeConfig() as config:
                 serve(config)
             case DemonstrateConfig() as config:
+                # It imports MuJoCo, which needs a library that may be missing.
+                load_mujoco()
+                from cpn_sim_worker.demonstrate import demonstrate
+
                 demonstrate(config)
-    except ConfigError as error:
+    except (ConfigError, OpenGLError) as error:
         sys.exit(str(error))

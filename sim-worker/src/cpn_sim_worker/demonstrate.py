@@ -1,12 +1,11 @@
 """Streams expert demonstrations to the trainer."""
 
 import multiprocessing
-import os
 import queue
 import signal
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 
 import zenoh
@@ -14,38 +13,14 @@ from tqdm import tqdm
 
 from cpn.v1 import demonstration_pb2, types_pb2
 from cpn_sim_worker.expert import ExpertFailedError, solve
+from cpn_sim_worker.opengl import OpenGLError
+from cpn_sim_worker.options import DemonstrateConfig
 from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.session import UnavailableError, ZenohConfig, open_session
+from cpn_sim_worker.session import UnavailableError, open_session
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.stream import EpisodeLostError, digest, is_recorded, send_episode
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, MissingExtraError, SeedError, check_task
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, MissingExtraError, SeedError
 from cpn_sim_worker.wire import RequestError, action_to_proto, image_to_proto
-
-
-@dataclass(frozen=True)
-class DemonstrateConfig:
-    """Stream successful expert episodes to the trainer.
-
-    Episodes that the trainer holds already cost one short query each, so an interrupted run is simply run again.
-    """
-
-    tasks: tuple[str, ...] = TASKS
-    episodes: int = 25
-    """Successful episodes per task."""
-    first_seed: int = 0
-    """Seed of the first try. Each failure of the expert moves on to the next seed."""
-    processes: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
-    """Processes that share the tasks."""
-    zenoh: ZenohConfig = field(default_factory=ZenohConfig)
-
-    def __post_init__(self) -> None:
-        for task in self.tasks:
-            check_task(task)
-        if not 0 <= self.first_seed < FIRST_EVALUATION_SEED:
-            raise ValueError(f"first_seed: expected 0 to {FIRST_EVALUATION_SEED - 1}, got {self.first_seed}")
-        for name in ("episodes", "processes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -101,8 +76,8 @@ def _run_tasks(
     """What one process does: all episodes of a task, then of the next, until it is handed None."""
     # An interrupt from the terminal reaches every process; the parent's is the one to act.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    simulator = Simulator(Renderer())
     try:
+        simulator = Simulator(Renderer())
         with open_session(config.zenoh) as session:
             for task in iter(tasks.get, None):
                 kept, seed = 0, config.first_seed
@@ -116,7 +91,7 @@ def _run_tasks(
                     except ExpertFailedError:
                         tries.put(Try(task, kept=False))
                     seed += 1
-    except (UnavailableError, RequestError, EpisodeLostError, MissingExtraError, SeedError) as error:
+    except (UnavailableError, RequestError, EpisodeLostError, MissingExtraError, SeedError, OpenGLError) as error:
         sys.exit(f"demonstrations stopped: {error}")
 
 

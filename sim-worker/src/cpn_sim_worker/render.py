@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from mujoco.gl_context import GLContext
 from numpy.typing import NDArray
 
 from cpn_sim_worker.meshes import LIBRARIES, Decimation, decimated
+from cpn_sim_worker.opengl import OpenGLError, open_context
 from cpn_sim_worker.render_spec import RenderSpec, installed_version
 from cpn_sim_worker.scene import Scene
 from cpn_sim_worker.spaces import IMAGE_SIZE
@@ -42,9 +42,8 @@ class Renderer:
         if Renderer._exists:
             raise RuntimeError("a process can hold one Renderer only: a second one would return garbage frames")
         self._decimation = decimation
-        self._gl = GLContext(IMAGE_SIZE, IMAGE_SIZE)
+        self._gl = open_context(IMAGE_SIZE, IMAGE_SIZE)
         Renderer._exists = True
-        self._gl.make_current()
         self._viewport = mujoco.MjrRect(0, 0, IMAGE_SIZE, IMAGE_SIZE)
         self._option = mujoco.MjvOption()
         # Sites are markers of no substance, and among them are the coloured goals that would give the task away.
@@ -89,7 +88,10 @@ class Renderer:
         self._drawing.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._drawing.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._camera.fixedcamid = model.camera(scene.camera.name).id
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        except mujoco.FatalError as error:
+            raise OpenGLError(error) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._model = model
         self._scene = scene

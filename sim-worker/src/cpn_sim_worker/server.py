@@ -1,5 +1,7 @@
 """Serves one simulator over zenoh."""
 
+from __future__ import annotations
+
 import logging
 import os
 import queue
@@ -8,20 +10,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import zenoh
 from google.protobuf.message import Message
-from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
-from cpn_sim_worker.episode import EpisodeRunner
-from cpn_sim_worker.render import Renderer
-from cpn_sim_worker.session import REMINDER_SECONDS, StoppedError, ZenohConfig, open_session
-from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.opengl import OpenGLError, load_mujoco
+from cpn_sim_worker.options import ServeConfig
+from cpn_sim_worker.session import REMINDER_SECONDS, ConfigError, StoppedError, open_session
 from cpn_sim_worker.wire import RequestError, decode, encoding
+
+if TYPE_CHECKING:
+    from cpn_sim_worker.episode import EpisodeRunner
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +37,9 @@ QUEUE_LENGTH = 8
 POLL_SECONDS = 0.1
 """How long a signal to stop may go unnoticed while no request comes."""
 
+FIRST_TASK = "reach"
+"""Task of the frame that is drawn before anybody asks."""
+
 LEASE_SECONDS = 15.0
 """Time that the token of a worker that has died may linger: zenoh's lease, 10 s, and some more."""
 ANSWER_SECONDS = 2.0
@@ -40,24 +47,6 @@ ANSWER_SECONDS = 2.0
 MEETING_SECONDS = 1.5
 """Time after a change of connections in which others may still be joining: peers find each other one by one, and come
 back one by one to a router that was started again."""
-
-
-@dataclass(frozen=True)
-class ServeConfig:
-    """Serve Meta-World's and Jenga's tasks over zenoh until SIGTERM or SIGINT."""
-
-    worker: str = "w0"
-    """Name of this worker in its keys."""
-    max_steps: int = 150
-    """Steps after which an unsolved episode ends."""
-    zenoh: ZenohConfig = field(default_factory=ZenohConfig)
-
-    def __post_init__(self) -> None:
-        if not self.worker or any(character in "/*$?#" for character in self.worker):
-            raise ValueError(f"worker: expected a name without any of / * $ ? #, got {self.worker!r}")
-        # Meta-World's environments refuse to go on after that many; Jenga would.
-        if not 1 <= self.max_steps <= SawyerXYZEnv.max_path_length:
-            raise ValueError(f"max_steps: expected 1 to {SawyerXYZEnv.max_path_length}, got {self.max_steps}")
 
 
 class NameTakenError(Exception):
@@ -208,14 +197,52 @@ def serve(config: ServeConfig) -> None:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    episodes = EpisodeRunner(Simulator(Renderer()), config.max_steps)
-    try:
-        with open_session(config.zenoh, stop) as session:
+
+    with ExitStack() as network, ThreadPoolExecutor(1) as joining:
+
+        def join() -> zenoh.Session:
+            session = network.enter_context(open_session(config.zenoh, stop))
             claim_name(session, config.worker, stop)
-            SimServer(session, config.worker, episodes).run(stop)
-    except StoppedError as error:
-        log.info("%s", error)
-        # Not by way of the interpreter's end, which a thread still inside `zenoh.open` may abort.
-        os._exit(0)
-    except NameTakenError as error:
-        sys.exit(str(error))
+            return session
+
+        # Side by side: the network is mostly waited for.
+        joined = joining.submit(join)
+        try:
+            episodes = _drawing_episodes(config.max_steps)
+            SimServer(joined.result(), config.worker, episodes).run(stop)
+        except StoppedError as error:
+            log.info("%s", error)
+            _exit(0)
+        except (ConfigError, NameTakenError, OpenGLError) as error:
+            print(error, file=sys.stderr)
+            _exit(1)
+        finally:
+            stop.set()
+
+
+def _exit(status: int) -> NoReturn:
+    """Not by way of the interpreter's end, which a thread still inside `zenoh.open` may abort."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _drawing_episodes(max_steps: int) -> EpisodeRunner:
+    """A simulator that has drawn a frame: what keeps it from that comes up before anybody relies on the worker.
+
+    Raises:
+        ConfigError: If a variable for OpenGL is at fault.
+        OpenGLError: If OpenGL is missing or does not draw.
+    """
+    load_mujoco()
+    # Only here, since they import MuJoCo.
+    from cpn_sim_worker.episode import EpisodeRunner
+    from cpn_sim_worker.render import Renderer
+    from cpn_sim_worker.simulator import Simulator
+
+    simulator = Simulator(Renderer())
+    simulator.reset(FIRST_TASK, seed=0)
+    frame = simulator.frame()
+    if frame.min() == frame.max():
+        raise OpenGLError("a picture of one colour")
+    return EpisodeRunner(simulator, max_steps)

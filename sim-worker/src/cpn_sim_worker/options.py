@@ -1,0 +1,53 @@
+"""Options of the subcommands. They import no simulator, which loads while a worker joins its network."""
+
+import os
+from dataclasses import dataclass, field
+
+from cpn_sim_worker.session import ZenohConfig
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, check_task
+
+MAX_STEPS = 500
+"""Steps after which Meta-World's environments refuse to go on; Jenga would."""
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """Serve Meta-World's and Jenga's tasks over zenoh until SIGTERM or SIGINT."""
+
+    worker: str = "w0"
+    """Name of this worker in its keys."""
+    max_steps: int = 150
+    """Steps after which an unsolved episode ends."""
+    zenoh: ZenohConfig = field(default_factory=ZenohConfig)
+
+    def __post_init__(self) -> None:
+        if not self.worker or any(character in "/*$?#" for character in self.worker):
+            raise ValueError(f"worker: expected a name without any of / * $ ? #, got {self.worker!r}")
+        if not 1 <= self.max_steps <= MAX_STEPS:
+            raise ValueError(f"max_steps: expected 1 to {MAX_STEPS}, got {self.max_steps}")
+
+
+@dataclass(frozen=True)
+class DemonstrateConfig:
+    """Stream successful expert episodes to the trainer.
+
+    Episodes that the trainer holds already cost one short query each, so an interrupted run is simply run again.
+    """
+
+    tasks: tuple[str, ...] = TASKS
+    episodes: int = 25
+    """Successful episodes per task."""
+    first_seed: int = 0
+    """Seed of the first try. Each failure of the expert moves on to the next seed."""
+    processes: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    """Processes that share the tasks."""
+    zenoh: ZenohConfig = field(default_factory=ZenohConfig)
+
+    def __post_init__(self) -> None:
+        for task in self.tasks:
+            check_task(task)
+        if not 0 <= self.first_seed < FIRST_EVALUATION_SEED:
+            raise ValueError(f"first_seed: expected 0 to {FIRST_EVALUATION_SEED - 1}, got {self.first_seed}")
+        for name in ("episodes", "processes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
