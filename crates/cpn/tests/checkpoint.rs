@@ -9,6 +9,7 @@ use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
 use cpn::{Agent, MethodKind, positions};
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 
 fn provenance() -> Provenance {
     Provenance {
@@ -150,4 +151,40 @@ fn a_configuration_out_of_range_builds_nothing() {
     assert_eq!(message, "checkpoint model: encoder.layers.width: expected 1 to 512, got 1000000");
     let message = position(|encoder| encoder["centre_mm"] = json!([1, 2]));
     assert!(message.starts_with("checkpoint metadata: "), "{message}");
+}
+
+/// Names and shapes in the tables of `docs/checkpoint-format.md`, as the page says they are in the shipped model.
+fn documented() -> BTreeMap<String, String> {
+    let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/checkpoint-format.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    let rows =
+        page.lines().filter(|line| line.contains("weight`") || line.contains("bias`") || line.contains("`step_size`"));
+    let cells = rows.filter_map(|line| line.strip_prefix("| `")?.strip_suffix("` |")?.split_once("` |"));
+    cells.filter_map(|(name, rest)| Some((name.to_owned(), rest.rsplit_once('`')?.1.to_owned()))).collect()
+}
+
+#[test]
+fn the_page_lists_every_tensor_of_a_shipped_model() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/cpn.safetensors");
+    let bytes = std::fs::read(path).unwrap();
+    let agent = checkpoint::from_bytes(&bytes).unwrap().agent;
+    let mut shipped: BTreeMap<_, _> = agent
+        .variables()
+        .variables()
+        .into_iter()
+        .map(|(name, tensor)| (name, format!("{:?}", tensor.size())))
+        .collect();
+    let documented = documented();
+    assert!(documented.len() > 20, "{documented:?}");
+    for (name, shape) in &documented {
+        assert_eq!(shipped.remove(name).as_ref(), Some(shape), "{name}");
+    }
+    // The attenuation networks of the trunk stand for those of the other layers.
+    let trunk: Vec<_> = documented.keys().filter_map(|name| name.strip_prefix("network.trunk.")).collect();
+    for layer in ["policy_0", "policy_1", "dynamics_0", "dynamics_1"] {
+        for part in trunk.iter().filter(|part| part.starts_with("u.") || part.starts_with("v.")) {
+            assert!(shipped.remove(&format!("network.{layer}.{part}")).is_some(), "{layer}.{part}");
+        }
+    }
+    assert!(shipped.is_empty(), "not on the page: {shipped:?}");
 }
