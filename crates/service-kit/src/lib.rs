@@ -7,6 +7,7 @@ pub mod files;
 pub mod grpc;
 pub mod listener;
 pub mod metrics;
+pub mod process;
 pub mod session;
 pub mod shutdown;
 pub mod telemetry;

@@ -1,6 +1,7 @@
 //! Joining a zenoh network, and knowing whether one is joined.
 
 use crate::listener::{self, ListenConfig};
+use crate::process::ZENOH_RUNTIME;
 use crate::tls::Tls;
 use anyhow::{Context, anyhow, bail, ensure};
 use clap::builder::FalseyValueParser;
@@ -178,6 +179,9 @@ impl SessionConfig {
                 .map_err(|_| anyhow!("password_file {}: expected a password, got none", file.display()))?;
         }
         if let Some(tls) = self.tls()? {
+            if std::env::var_os(ZENOH_RUNTIME).is_none() {
+                warn!("{ZENOH_RUNTIME} is not set: zenoh's TLS links are not safe on several threads");
+            }
             // Zenoh would tell of a faulty file only as of a router that does not answer.
             tls.client()?;
             for (key, file) in [

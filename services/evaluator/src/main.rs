@@ -4,8 +4,11 @@ use anyhow::Context;
 use evaluator::{Cli, Command, Summary};
 use std::process::ExitCode;
 
-#[tokio::main]
-async fn main() -> anyhow::Result<ExitCode> {
+fn main() -> anyhow::Result<ExitCode> {
+    service_kit::process::run(program())
+}
+
+async fn program() -> anyhow::Result<ExitCode> {
     let _telemetry = service_kit::telemetry::init("cpn-eval")?;
     match service_kit::config::parse::<Cli>().command {
         Command::Run(args) => tell(&evaluator::run(&args).await?, args.json),

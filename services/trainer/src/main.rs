@@ -25,8 +25,11 @@ use trainer::{client, memory, mirror, publish, replay, service, verify};
 use wire::training::{Run, RunState, StartRunRequest};
 use zenoh::Session;
 
-#[tokio::main]
-async fn main() -> anyhow::Result<()> {
+fn main() -> anyhow::Result<()> {
+    service_kit::process::run(program())
+}
+
+async fn program() -> anyhow::Result<()> {
     let cli: Cli = config::parse();
     let _telemetry = telemetry::init("cpn-trainer")?;
     match cli.command {

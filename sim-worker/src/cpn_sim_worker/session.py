@@ -213,6 +213,9 @@ def _set_tls(config: zenoh.Config, ca: Path, certificate: Path, private_key: Pat
     }
     for key, value in settings.items():
         _set(config, f"transport/link/tls/{key}", value)
+    # Zenoh's TLS links read and write the same stream from two threads at once, which corrupts memory sooner or later
+    # (eclipse-zenoh/zenoh#2557). Zenoh reads this when its first session is opened.
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), tx: (handover: rx))")
 
 
 def _check_endpoints(config: zenoh.Config, *, insecure: bool) -> None:
