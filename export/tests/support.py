@@ -38,6 +38,9 @@ class Sample:
     state_size: int = STATE_SIZE
     steps: int | None = None
     digest: str | None = None
+    step_hz: float | None = None
+    """What the times of steps tell, if not `control_hz`."""
+    action_scale: float = 1.0
     last_action: bool = False
     """Whether the goal frame has an action, which it must not have."""
     goal_position: tuple[float, ...] = (0.5, 0.25, 0.125)
@@ -51,7 +54,7 @@ class Sample:
         random = np.random.default_rng([self.seed, *self.task.encode()])
         count = self.length + 1
         self.frames = random.integers(0, 256, (count, SIZE, SIZE, 3), np.uint8)
-        self.actions = random.uniform(-1, 1, (self.length, ACTION_SIZE)).astype(np.float32)
+        self.actions = random.uniform(-1, 1, (self.length, ACTION_SIZE)).astype(np.float32) * self.action_scale
         self.states = random.normal(size=(count, self.state_size)).astype(np.float32)
         self.rewards = random.uniform(0, 10, count).astype(np.float32)
         self.rewards[0] = 0
@@ -61,8 +64,9 @@ class Sample:
     def episode_id(self) -> str:
         return f"{self.task}-{self.seed}"
 
-    def write(self, dataset: Path) -> Path:
-        path = dataset / self.task / f"{self.episode_id}.mcap"
+    def write(self, dataset: Path, place: str | None = None) -> Path:
+        """Writes the recording to where it belongs, or to another place."""
+        path = dataset / (place or f"{self.task}/{self.episode_id}.mcap")
         path.parent.mkdir(parents=True, exist_ok=True)
         actions = [*self.actions, np.ones(ACTION_SIZE, np.float32) if self.last_action else np.empty(0, np.float32)]
         digest = hashlib.sha256()
@@ -81,7 +85,7 @@ class Sample:
         with path.open("wb") as file, Writer(file) as writer:
             writer.write_message("/episode", header, log_time=0, publish_time=0)
             for t, action in enumerate(actions):
-                time = round(t * 1e9 / self.control_hz)
+                time = round(t * 1e9 / (self.step_hz or self.control_hz))
                 frame = RawImage(
                     frame_id="camera",
                     width=SIZE,

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,10 @@ from cpn_export.cli import lerobot
 from cpn_export.error import ExportError
 from cpn_export.lerobot_dataset import write_dataset
 from cpn_export.selection import select_recordings
+from cpn_export.workshop import workshop
 from tests.support import Sample
+
+COMMAND = str(Path(sys.executable).with_name("cpn-export-lerobot"))
 
 
 def export(dataset: Path, out: Path, *tasks: str, episodes: int | None = None) -> LeRobotDataset:
@@ -86,21 +91,71 @@ def test_what_exists_is_left_alone(tmp_path: Path) -> None:
     assert list(out.iterdir()) == []
 
 
-def test_a_killed_run_is_replaced_and_a_failed_one_leaves_nothing(tmp_path: Path) -> None:
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_failed_run_leaves_nothing(tmp_path: Path) -> None:
     Sample("reach", 1).write(tmp_path / "data")
-    odd = Sample("reach", 2, state_size=12).write(tmp_path / "data")
-    partial = tmp_path / "out.partial"
-    partial.mkdir()
-    (partial / "half-written").touch()
+    Sample("reach", 2, state_size=12).write(tmp_path / "data")
     with pytest.raises(ExportError, match=r"reach-2\.mcap: expected the sizes of .*reach-1\.mcap"):
         export(tmp_path / "data", tmp_path / "out")
-    assert {path.name for path in tmp_path.iterdir()} == {"data"}
-    odd.unlink()
-    partial.mkdir()
-    (partial / "half-written").touch()
+    assert names(tmp_path) == {"data"}
+
+
+def test_a_killed_run_is_cleared_away(tmp_path: Path) -> None:
+    Sample("reach", 1).write(tmp_path / "data")
+    out = tmp_path / "out"
+    program = "import os, sys; from pathlib import Path; from cpn_export.workshop import workshop\n"
+    program += "with workshop(Path(sys.argv[1])) as folder: (folder / 'half').touch(); os.kill(os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", program, str(out)], check=False)
+    assert len(names(tmp_path)) == 2
+    with workshop(out) as at_work:
+        assert names(tmp_path) == {"data", at_work.name}
+        export(tmp_path / "data", out)
+        assert names(tmp_path) == {"data", "out", at_work.name}
+
+
+@pytest.mark.parametrize("name", ["out.partial", ".out.partial", ".out.mine.partial"])
+def test_nobodys_folders_are_deleted(tmp_path: Path, name: str) -> None:
+    Sample("reach", 1).write(tmp_path / "data")
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "mine").touch()
     export(tmp_path / "data", tmp_path / "out")
-    assert not (tmp_path / "out" / "half-written").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {"data", "out"}
+    assert (tmp_path / name / "mine").exists()
+    assert names(tmp_path) == {"data", "out", name}
+
+
+def test_a_link_to_nowhere_is_left_alone(tmp_path: Path) -> None:
+    Sample("reach", 1).write(tmp_path / "data")
+    out = tmp_path / "out"
+    out.symlink_to("nowhere")
+    with pytest.raises(ExportError, match="out: expected a path where nothing is yet"):
+        export(tmp_path / "data", out)
+    assert out.is_symlink()
+
+
+@pytest.mark.parametrize("blocks", [4, 64])
+def test_a_full_disk_is_one_line(tmp_path: Path, blocks: int) -> None:
+    """As if after so many KiB of a file nothing fitted any more: not a picture, or not the whole of a table."""
+    Sample("reach", 1, length=40).write(tmp_path / "data")
+    command = [COMMAND, "--dataset", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
+    limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$@"', "bash", *command]
+    run = subprocess.run(limited, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert "Traceback" not in run.stderr
+    message = run.stderr.splitlines()[-1]
+    assert message.startswith(f"cpn-export-lerobot: out: expected room for a dataset at {tmp_path / 'out'}, got ")
+    assert message.endswith("File too large")
+    assert run.stdout == ""
+    assert names(tmp_path) == {"data"}
+
+
+def test_a_place_that_cannot_be_is_named(tmp_path: Path) -> None:
+    Sample("reach", 1).write(tmp_path / "data")
+    (tmp_path / "file").touch()
+    with pytest.raises(ExportError, match=r"out: expected room for a dataset at .*/file/out, got (Not a|File exists)"):
+        export(tmp_path / "data", tmp_path / "file" / "out")
 
 
 def test_the_command_exports_and_says_what_is_wrong(

@@ -40,7 +40,10 @@ def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
         (Sample("reach", 1, steps=7), "steps: expected 7, got 6"),
         (Sample("reach", 1, last_action=True), "actions: expected 5, got 6"),
         (Sample("reach", 1, digest="00ff"), "digest: expected 00ff, got [0-9a-f]{64}"),
-        (Sample("reach", 1, length=0), "corrupt, or not a recording: .*need at least one array"),
+        (Sample("reach", 1, length=0), "steps: expected 2 or more, got 1"),
+        (Sample("reach", 1, action_scale=9), r"action of step \d: expected values in \[-1, 1\], got \["),
+        (Sample("reach", 1, action_scale=np.nan), r"action of step 0: expected values in \[-1, 1\], got \[nan"),
+        (Sample("reach", 1, step_hz=40), r"times at /step: expected \[0, 12500000, .*, got \[0, 25000000, "),
     ],
 )
 def test_steps_that_are_not_what_the_header_says_are_refused(tmp_path: Path, sample: Sample, message: str) -> None:

@@ -38,3 +38,42 @@ def test_a_rate_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
     Sample("reach", 1, control_hz=12.5).write(tmp_path)
     with pytest.raises(ExportError, match=r"control_hz: expected a whole number, as LeRobot's fps, got 12\.5"):
         select_recordings(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["reach/copy.mcap", "reach/reach-1 (1).mcap", "door-lock/reach-1.mcap"])
+def test_a_recording_is_taken_where_it_belongs_only(tmp_path: Path, place: str) -> None:
+    kept = Sample("reach", 1).write(tmp_path)
+    copied = Sample("reach", 1).write(tmp_path, place)
+    with pytest.raises(ExportError) as refusal:
+        select_recordings(tmp_path)
+    assert str(refusal.value) == f"{copied}: place: expected {kept}, got {copied}"
+    copied.unlink()
+    assert [header.path for header in select_recordings(tmp_path)] == [kept]
+
+
+def test_an_episode_is_taken_once(tmp_path: Path) -> None:
+    first, second = Sample("reach", 1, digest="00ff"), Sample("reach", 2, digest="00ff")
+    paths = [sample.write(tmp_path) for sample in (first, second)]
+    with pytest.raises(
+        ExportError, match=f"{paths[1]}: digest: expected one that no other has, got 00ff of {paths[0]}"
+    ):
+        select_recordings(tmp_path)
+
+
+def test_names_that_begin_with_a_dot_are_nobodys(tmp_path: Path) -> None:
+    kept = Sample("reach", 1).write(tmp_path)
+    for place in ("reach/._reach-1.mcap", ".Trash-1000/reach-1.mcap", ".reach/reach-2.mcap"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_bytes(b"\0\5\x16\7")
+    (tmp_path / "lost+found").mkdir()
+    (tmp_path / "README.md").touch()
+    assert [header.path for header in select_recordings(tmp_path)] == [kept]
+    with pytest.raises(ExportError, match=r"tasks: expected some of reach, got \.reach"):
+        select_recordings(tmp_path, (".reach",))
+
+
+def test_a_task_without_recordings_is_no_task(tmp_path: Path) -> None:
+    (tmp_path / "reach").mkdir()
+    (tmp_path / "reach" / "._reach-1.mcap").touch()
+    with pytest.raises(ExportError, match="dataset: expected recordings at"):
+        select_recordings(tmp_path)

@@ -1,8 +1,11 @@
 """Writes recordings as a LeRobotDataset v3."""
 
+import io
 import json
+import os
 import shutil
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from tqdm import tqdm
 
 from cpn_export.error import ExportError
 from cpn_export.recording import Episode, Header, read_episode
+from cpn_export.workshop import workshop
 
 ARM_STATE = ("hand_x", "hand_y", "hand_z", "gripper")
 """What the simulators' states begin with."""
@@ -29,17 +33,23 @@ def write_dataset(recordings: Sequence[Header], out: Path) -> None:
     """Writes `recordings`, one or more that are alike, as a dataset at `out`; it appears whole or not at all.
 
     Raises:
-        ExportError: If `out` exists, or a recording is faulty or of other sizes than the first.
+        ExportError: If `out` exists or cannot be written, or a recording is faulty or of other sizes than the first.
     """
-    if out.exists():
+    if os.path.lexists(out):
         raise ExportError(f"out: expected a path where nothing is yet, got {out}")
-    partial = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # Of a run that was killed.
     try:
-        _write(recordings, partial)
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with workshop(out) as folder:
+            partial = folder / out.name
+            _write(recordings, partial)
+            # An empty folder that came meanwhile would be replaced without a word.
+            if os.path.lexists(out):
+                raise ExportError(f"out: expected a path where nothing is yet, got {out}")
+            partial.rename(out)
+    except OSError as error:
+        # Libraries word the same fault in their own ways.
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise ExportError(f"out: expected room for a dataset at {out}, got {reason}") from error
 
 
 def features(episode: Episode) -> dict[str, dict[str, Any]]:
@@ -71,6 +81,7 @@ def _write(recordings: Sequence[Header], root: Path) -> None:
                 _add(dataset, header, episode)
             except ValueError as error:
                 raise ExportError(f"{header.path}: expected the sizes of {recordings[0].path}: {error}") from error
+            dataset.save_episode()
             goal = Path("goals", f"episode-{index:06d}.png")
             Image.fromarray(episode.frames[-1]).save(root / goal)
             provenance.append(_provenance(index, header, goal))
@@ -88,7 +99,6 @@ def _create(first: Header, root: Path) -> LeRobotDataset:
         raise ExportError(
             f"{first.path}: state: expected {len(ARM_STATE)} values or more, got {episode.states.shape[1]}"
         )
-    root.parent.mkdir(parents=True, exist_ok=True)
     dataset = LeRobotDataset.create(
         repo_id=root.stem,
         root=root,
@@ -114,8 +124,11 @@ def _add(dataset: LeRobotDataset, header: Header, episode: Episode) -> None:
             "next.success": episode.successes[t + 1, np.newaxis],
             "task": header.task,
         }
-        dataset.add_frame(row)
-    dataset.save_episode()
+        # LeRobot prints what keeps it from writing a picture, and goes on without.
+        with redirect_stdout(io.StringIO()) as said:
+            dataset.add_frame(row)
+        if not Path((dataset.episode_buffer or {})["observation.image"][t]).exists():
+            raise OSError(said.getvalue().strip())
 
 
 def _provenance(index: int, header: Header, goal: Path) -> dict[str, Any]:

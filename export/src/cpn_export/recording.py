@@ -1,6 +1,7 @@
 """Reads recordings: MCAP files of one episode each, as `proto/cpn/v1/demonstration.proto` describes them."""
 
 import hashlib
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +15,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from cpn_export.error import ExportError
+
+MIN_STEPS = 2
+"""One with an action and the goal frame."""
 
 EPISODE, CAMERA, STEP = "/episode", "/camera", "/step"
 SCHEMAS = {EPISODE: "cpn.v1.RecordedEpisode", CAMERA: "foxglove.RawImage", STEP: "cpn.v1.RecordedStep"}
@@ -86,17 +90,26 @@ def read_episode(header: Header) -> Episode:
     with _reading(path):
         messages: defaultdict[str, list[Any]] = defaultdict(list)
         times: defaultdict[str, list[int]] = defaultdict(list)
-        for topic, log_time, message in _messages(path, [CAMERA, STEP]):
+        for topic, log_time, message in _messages(path, [EPISODE, CAMERA, STEP]):
             messages[topic].append(message)
             times[topic].append(log_time)
         images, steps = messages[CAMERA], messages[STEP]
 
+        _check(path, f"messages at {EPISODE}", 1, len(messages[EPISODE]))
         _check(path, "steps", header.steps, len(steps))
         _check(path, f"messages at {CAMERA}", header.steps, len(images))
+        if len(steps) < MIN_STEPS:
+            raise ExportError(f"{path}: steps: expected {MIN_STEPS} or more, got {len(steps)}")
+        _check(path, f"times at {STEP}", [_log_time(number, header) for number in range(len(steps))], times[STEP])
         _check(path, f"times at {CAMERA}", times[STEP], times[CAMERA])
         _check(path, "numbers of the steps", list(range(len(steps))), [step.step for step in steps])
         _check(path, "actions", len(steps) - 1, sum(step.HasField("action") for step in steps))
         _check(path, "action of the goal frame", False, steps[-1].HasField("action"))
+        for number, step in enumerate(steps):
+            # Written so that NaN, which compares false with everything, is refused too.
+            if not all(abs(value) <= 1 for value in step.action.values):
+                got = list(step.action.values)
+                raise ExportError(f"{path}: action of step {number}: expected values in [-1, 1], got {got}")
         _check(path, "encodings of the frames", {"rgb8"}, {image.encoding for image in images})
         _check(path, "digest", header.digest, _digest(images, steps))
         return Episode(
@@ -106,6 +119,11 @@ def read_episode(header: Header) -> Episode:
             rewards=np.array([step.reward for step in steps], np.float32),
             successes=np.array([step.success for step in steps], np.bool_),
         )
+
+
+def _log_time(step: int, header: Header) -> int:
+    """When a step is, in nanoseconds since the start of the episode."""
+    return math.floor(step * 1e9 / header.control_hz + 0.5)
 
 
 def _digest(images: Sequence[Any], steps: Sequence[Any]) -> str:

@@ -1,6 +1,6 @@
 """Chooses the recordings that make a dataset."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpn_export.error import ExportError
@@ -16,12 +16,12 @@ def select_recordings(dataset: Path, tasks: Sequence[str] = (), episodes: int | 
         episodes: How many of each task, lowest seeds first; all of them if None.
 
     Raises:
-        ExportError: If a task is unknown, recordings are missing, or they differ in what a dataset has only one of.
+        ExportError: If a task is unknown, recordings are missing, not where they belong or there twice, or differ in
+            what a dataset has only one of.
     """
     if not dataset.is_dir():
         raise ExportError(f"dataset: expected a folder, got {dataset}")
-    known = sorted(path.parent.name for path in dataset.glob("*/*.mcap"))
-    known = list(dict.fromkeys(known))
+    known = [task for task in _names(dataset, Path.is_dir) if _paths(dataset / task)]
     if not known:
         raise ExportError(f"dataset: expected recordings at {dataset}/<task>/*.mcap, got none")
     for task in tasks:
@@ -30,13 +30,46 @@ def select_recordings(dataset: Path, tasks: Sequence[str] = (), episodes: int | 
     chosen: list[Header] = []
     for task in dict.fromkeys(tasks or known):
         headers = sorted(
-            (read_header(path) for path in (dataset / task).glob("*.mcap")), key=lambda header: header.seed
+            (_read_header(dataset, path) for path in _paths(dataset / task)), key=lambda header: header.seed
         )
         if episodes is not None and len(headers) < episodes:
             raise ExportError(f"episodes: expected {episodes} recordings of {task}, got {len(headers)}")
         chosen += headers[:episodes]
+    _check_distinct(chosen)
     _check_alike(chosen)
     return chosen
+
+
+def _paths(folder: Path) -> list[Path]:
+    """The recordings in the folder of a task, by name."""
+    return [folder / name for name in _names(folder, lambda path: path.suffix == ".mcap")]
+
+
+def _names(folder: Path, wanted: Callable[[Path], bool]) -> list[str]:
+    """Names in a folder, in order. Those that begin with a dot are nobody's: file systems and desktops leave them."""
+    try:
+        return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and wanted(path))
+    except OSError as error:
+        raise ExportError(f"{folder}: expected a folder that can be read, got {error.strerror}") from error
+
+
+def _read_header(dataset: Path, path: Path) -> Header:
+    """Reads a header, which must be that of the recording that belongs there: a copy elsewhere is none of its own."""
+    header = read_header(path)
+    expected = dataset / header.task / f"{header.episode_id}.mcap"
+    if path != expected:
+        raise ExportError(f"{path}: place: expected {expected}, got {path}")
+    return header
+
+
+def _check_distinct(headers: Sequence[Header]) -> None:
+    paths: dict[str, Path] = {}
+    for header in headers:
+        # By digest too: under another name it is still the same episode.
+        for field in ("episode_id", "digest"):
+            value = getattr(header, field)
+            if (other := paths.setdefault(f"{field} {value}", header.path)) != header.path:
+                raise ExportError(f"{header.path}: {field}: expected one that no other has, got {value} of {other}")
 
 
 def _check_alike(headers: Sequence[Header]) -> None:
