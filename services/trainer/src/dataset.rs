@@ -2,7 +2,7 @@
 
 use crate::frame;
 use crate::recordings::{self, dataset_digest};
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use cpn::{Frames, Input, images};
 use rayon::prelude::*;
 use recording::Episode as Recording;
@@ -39,8 +39,8 @@ impl Dataset {
     /// Reads every episode of `folder` but those of the `held_out` tasks, as images or as positions.
     ///
     /// # Errors
-    /// If a recording is damaged or has no positions where these are asked for, the episodes differ in the size of their
-    /// actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
+    /// If a recording is damaged or has no positions where these are asked for, two have one id, the episodes differ in the
+    /// size of their actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
     /// pen than meant.
     pub fn load(folder: &Path, held_out: &[String], input: Input) -> anyhow::Result<Self> {
         let all_tasks = recordings::tasks(folder)?;
@@ -51,6 +51,9 @@ impl Dataset {
         let mut paths = recordings::paths(folder)?;
         paths.retain(|path| !held_out.iter().any(|task| path.starts_with(task)));
         ensure!(!paths.is_empty(), "{}: expected demonstrations, got none", folder.display());
+        if let Some(duplicate) = recordings::duplicates(&paths).into_iter().next() {
+            bail!(duplicate);
+        }
         // The headers tell how much room everything takes; then each core fills in episodes.
         let infos = paths.par_iter().map(|path| header(path)).collect::<anyhow::Result<Vec<_>>>()?;
         let (mut episodes, mut count) = (Vec::with_capacity(infos.len()), 0);

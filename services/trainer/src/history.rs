@@ -150,17 +150,16 @@ impl History {
     /// Removes weights that no version has.
     fn sweep(&self, folder: &Path) {
         let sweep = || {
-            for entry in std::fs::read_dir(folder)? {
-                let path = entry?.path();
+            for path in files::list(folder)? {
                 let digest = stem(&path);
                 if digest.is_some_and(|digest| self.versions.iter().all(|manifest| manifest.digest != digest)) {
                     std::fs::remove_file(path)?;
                 }
             }
-            std::io::Result::Ok(())
+            anyhow::Ok(())
         };
         if let Err(error) = sweep() {
-            warn!(folder = %folder.display(), %error, "old weights not removed");
+            warn!(error = format!("{error:#}"), "old weights not removed");
         }
     }
 }
@@ -173,6 +172,11 @@ pub(crate) fn stem(path: &Path) -> Option<String> {
 /// Where the weights of a digest are.
 pub(crate) fn weights(folder: &Path, digest: &str) -> PathBuf {
     folder.join(format!("{digest}.{EXTENSION}"))
+}
+
+/// Whether a checkpoint's file has a digest.
+pub(crate) fn is_whole(path: &Path, expected: &str) -> bool {
+    digest(path).is_ok_and(|got| got.as_deref() == Some(expected))
 }
 
 /// The digest of a checkpoint's file; none if there is no such file.

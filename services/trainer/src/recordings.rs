@@ -1,18 +1,21 @@
 //! A folder of recordings: `<task>/<episode id>.mcap`.
 
 use anyhow::{Context, ensure};
+use rayon::prelude::*;
 use recording::Episode;
 use service_kit::files;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tracing::warn;
 use wire::demonstration::RecordedEpisode;
 use wire::{Code, Error};
 
-/// The recordings that one process keeps, known by their headers.
+/// The recordings that one process keeps. What is said of them holds of the files on disk: one that was removed, cut or
+/// replaced meanwhile is not taken for kept.
 #[derive(Debug)]
 pub struct Recordings {
     folder: PathBuf,
@@ -23,16 +26,78 @@ pub struct Recordings {
     writing: Mutex<()>,
 }
 
+/// The episodes that were whole when their files were read, by id.
 #[derive(Debug, Default)]
-struct Index {
-    by_id: BTreeMap<String, RecordedEpisode>,
+struct Index(BTreeMap<String, Kept>);
+
+/// A file that was read to its end.
+#[derive(Debug, Clone)]
+struct Kept {
+    info: RecordedEpisode,
+    stamp: Stamp,
+}
+
+/// Tells apart what a file was before and after it was written: its inode, size, and when it changed.
+type Stamp = (u64, u64, i64, i64);
+
+fn stamp(path: &Path) -> std::io::Result<Stamp> {
+    let metadata = path.metadata()?;
+    Ok((metadata.ino(), metadata.len(), metadata.ctime(), metadata.ctime_nsec()))
+}
+
+impl Kept {
+    /// Reads a recording to its end.
+    fn read(folder: &Path, found: &Path) -> anyhow::Result<Self> {
+        // If the file is replaced while it is read, it is read once more.
+        let stamp = stamp(found)?;
+        let info = read(folder, found)?.info().clone();
+        Ok(Self { info, stamp })
+    }
+}
+
+impl Index {
+    /// A kept episode; what is not on disk any more as it was read is read again, or forgotten.
+    fn get(&mut self, folder: &Path, episode_id: &str) -> Option<&RecordedEpisode> {
+        let Kept { info, stamp: known } = self.0.get(episode_id)?;
+        let path = path(folder, info);
+        if stamp(&path).ok() != Some(*known) {
+            self.take_in(folder, episode_id, &path);
+        }
+        self.0.get(episode_id).map(|kept| &kept.info)
+    }
+
+    /// Looks at the place of an episode, whose file may have come, gone or changed.
+    fn take_in(&mut self, folder: &Path, episode_id: &str, path: &Path) {
+        match Kept::read(folder, path) {
+            Ok(kept) => drop(self.0.insert(episode_id.to_owned(), kept)),
+            Err(error) => {
+                if self.0.remove(episode_id).is_some() {
+                    warn!(episode_id, error = format!("{error:#}"), "not kept any more");
+                }
+            }
+        }
+    }
+
+    /// Every kept episode, by id.
+    fn all(&mut self, folder: &Path) -> Vec<RecordedEpisode> {
+        let ids: Vec<_> = self.0.keys().cloned().collect();
+        ids.iter().filter_map(|id| self.get(folder, id).cloned()).collect()
+    }
+
     /// Of every episode; none before the first.
-    render_spec: Option<String>,
+    fn render_spec(&mut self, folder: &Path) -> Option<String> {
+        while let Some(id) = self.0.keys().next().cloned() {
+            if let Some(info) = self.get(folder, &id) {
+                return Some(info.render_spec.clone());
+            }
+        }
+        None
+    }
 }
 
 impl Recordings {
-    /// Takes over a folder: removes what a killed process left unfinished and reads every header. A file that is no
-    /// recording is passed over; when its episode comes again, it takes the file's place.
+    /// Takes over a folder: removes what a killed process left unfinished and reads every recording, on every core. A file
+    /// that is no whole recording is passed over; when its episode comes again, it takes the file's place.
     ///
     /// # Errors
     /// If the folder cannot be made or read, another process has it, or its recordings differ in their render spec.
@@ -41,42 +106,52 @@ impl Recordings {
         for task in tasks(&folder)? {
             files::remove_unfinished(&folder.join(task))?;
         }
-        let mut index = Index::default();
-        for path in paths(&folder)? {
-            let header = || check_place(&folder, &path, recording::read_header(&path)?);
-            let info = match header() {
-                Ok(info) => info,
+        let paths = paths(&folder)?;
+        let read: Vec<_> = paths.par_iter().map(|path| Kept::read(&folder, path)).collect();
+        let mut index: BTreeMap<String, Kept> = BTreeMap::new();
+        for (path, read) in paths.iter().zip(read) {
+            let kept = match read {
+                Ok(kept) => kept,
                 Err(error) => {
-                    warn!(path = %path.display(), error = format!("{error:#}"), "passed over");
+                    warn!(error = format!("{error:#}"), "passed over");
                     continue;
                 }
             };
-            let expected = index.render_spec.get_or_insert_with(|| info.render_spec.clone());
-            let (got, path) = (&info.render_spec, path.display());
-            ensure!(expected == got, "{path}: render_spec: expected {expected:?} like the files before, got {got:?}");
-            index.by_id.insert(info.episode_id.clone(), info);
+            let (info, path) = (&kept.info, path.display());
+            if let Some(first) = index.values().next() {
+                let (expected, got) = (&first.info.render_spec, &info.render_spec);
+                ensure!(
+                    expected == got,
+                    "{path}: render_spec: expected {expected:?} like the files before, got {got:?}"
+                );
+            }
+            if let Some(Kept { info: first, .. }) = index.get(&info.episode_id) {
+                warn!("{path}: passed over: its id is that of an episode of {}", first.variation.task);
+                continue;
+            }
+            index.insert(info.episode_id.clone(), kept);
         }
-        Ok(Self { folder, _lock: lock, index: Mutex::new(index), writing: Mutex::new(()) })
+        Ok(Self { folder, _lock: lock, index: Mutex::new(Index(index)), writing: Mutex::new(()) })
     }
 
     /// Whether an episode is kept.
     pub fn contains(&self, episode_id: &str) -> bool {
-        self.index().by_id.contains_key(episode_id)
+        self.index().get(&self.folder, episode_id).is_some()
     }
 
     /// What is known of a kept episode.
     pub fn get(&self, episode_id: &str) -> Option<RecordedEpisode> {
-        self.index().by_id.get(episode_id).cloned()
+        self.index().get(&self.folder, episode_id).cloned()
     }
 
     /// How many episodes are kept.
     pub fn count(&self) -> usize {
-        self.index().by_id.len()
+        self.all().len()
     }
 
     /// Every kept episode, by id.
     pub fn all(&self) -> Vec<RecordedEpisode> {
-        self.index().by_id.values().cloned().collect()
+        self.index().all(&self.folder)
     }
 
     /// Whether an episode is still to be kept; if not, the same one is kept already.
@@ -84,18 +159,25 @@ impl Recordings {
     /// # Errors
     /// `FAILED_PRECONDITION` if another one is kept under its id, or it was rendered otherwise than those that are kept.
     pub fn lacks(&self, offered: &RecordedEpisode) -> Result<bool, Error> {
-        let index = self.index();
+        let mut index = self.index();
         let refused =
             |field, expected: &str, got: &str| Err(Error::new(Code::FailedPrecondition, field, expected, got));
-        if let Some(kept) = index.by_id.get(&offered.episode_id) {
+        if !index.0.contains_key(&offered.episode_id) {
+            // Somebody may have put it there.
+            let path = path(&self.folder, offered);
+            if path.exists() {
+                index.take_in(&self.folder, &offered.episode_id, &path);
+            }
+        }
+        if let Some(kept) = index.get(&self.folder, &offered.episode_id) {
             return match fields(kept).into_iter().zip(fields(offered)).find(|(kept, offered)| kept != offered) {
                 Some(((field, expected), (_, got))) => refused(field, &expected, &got),
                 None => Ok(false),
             };
         }
-        match &index.render_spec {
-            Some(expected) if *expected != offered.render_spec => {
-                refused("render_spec", expected, &offered.render_spec)
+        match index.render_spec(&self.folder) {
+            Some(expected) if expected != offered.render_spec => {
+                refused("render_spec", &expected, &offered.render_spec)
             }
             _ => Ok(true),
         }
@@ -112,23 +194,27 @@ impl Recordings {
             return Ok(());
         }
         let path = path(&self.folder, info);
-        let written = recording::to_bytes(episode).map_err(Into::into);
-        let written = written.and_then(|bytes| files::write_atomically(&path, &bytes));
-        written.map_err(|e| Error::new(Code::Internal, "episode_id", "a kept episode", format!("{e:#}")))?;
-        let mut index = self.index();
-        index.render_spec = Some(info.render_spec.clone());
-        index.by_id.insert(info.episode_id.clone(), info.clone());
+        let write = || {
+            files::write_atomically(&path, &recording::to_bytes(episode)?)?;
+            anyhow::Ok(stamp(&path)?)
+        };
+        let stamp =
+            write().map_err(|e| Error::new(Code::Internal, "episode_id", "a kept episode", format!("{e:#}")))?;
+        self.index().0.insert(info.episode_id.clone(), Kept { info: info.clone(), stamp });
         Ok(())
     }
 
     /// Reads a kept episode; none if there is no such.
     ///
     /// # Errors
-    /// `INTERNAL` if its file is damaged.
+    /// `INTERNAL` if its file is damaged; it is not taken for kept from then on.
     pub fn read(&self, episode_id: &str) -> Result<Option<Episode>, Error> {
         let Some(info) = self.get(episode_id) else { return Ok(None) };
-        let read = recording::read(&path(&self.folder, &info));
-        read.map(Some).map_err(|e| Error::new(Code::Internal, "episode_id", "a whole recording", e))
+        let path = path(&self.folder, &info);
+        read(&self.folder, &path).map(Some).map_err(|e| {
+            self.index().take_in(&self.folder, episode_id, &path);
+            Error::new(Code::Internal, "episode_id", "a whole recording", format!("{e:#}"))
+        })
     }
 
     fn index(&self) -> MutexGuard<'_, Index> {
@@ -179,7 +265,8 @@ pub fn read(folder: &Path, path: &Path) -> anyhow::Result<Episode> {
 /// # Errors
 /// If the folder cannot be read.
 pub fn tasks(folder: &Path) -> anyhow::Result<Vec<String>> {
-    names(folder, |path| path.is_dir())
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(files::list(folder)?.iter().filter(|path| path.is_dir()).map(name).collect())
 }
 
 /// The recordings of a folder, in order of task and name.
@@ -189,23 +276,21 @@ pub fn tasks(folder: &Path) -> anyhow::Result<Vec<String>> {
 pub fn paths(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut paths = Vec::new();
     for task in tasks(folder)? {
-        let folder = folder.join(task);
-        let names = names(&folder, |path| path.extension().is_some_and(|e| e == recording::EXTENSION))?;
-        paths.extend(names.into_iter().map(|name| folder.join(name)));
+        let found = files::list(&folder.join(task))?;
+        paths.extend(found.into_iter().filter(|path| path.extension().is_some_and(|e| e == recording::EXTENSION)));
     }
     Ok(paths)
 }
 
-fn names(folder: &Path, wanted: impl Fn(&Path) -> bool) -> anyhow::Result<Vec<String>> {
-    let mut names = Vec::new();
-    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
-        let entry = entry?;
-        if wanted(&entry.path()) {
-            names.push(entry.file_name().to_string_lossy().into_owned());
-        }
-    }
-    names.sort();
-    Ok(names)
+/// The recordings whose names, which are their episodes' ids, are those of others before.
+pub(crate) fn duplicates(paths: &[PathBuf]) -> Vec<String> {
+    let mut seen = HashMap::new();
+    let duplicate = |path: &PathBuf| {
+        let first = seen.insert(path.file_name()?.to_owned(), path.clone())?;
+        let (path, first) = (path.display(), first.display());
+        Some(format!("{path}: expected an id that no other episode has, got that of {first}"))
+    };
+    paths.iter().filter_map(duplicate).collect()
 }
 
 /// The digest of a dataset: SHA-256, in hex, over what is known of each episode, its digest and render spec included, in the

@@ -1,7 +1,7 @@
 //! Sends recordings: the steps that a worker sent, as far as a recorder lacks them.
 
 use crate::recordings;
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use backon::{ExponentialBuilder, Retryable};
 use recording::Episode;
 use std::path::Path;
@@ -18,7 +18,7 @@ const COMMIT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Sends every recording of `folder`, or those of some tasks, until all are kept.
 ///
 /// # Errors
-/// If a recording is damaged, a task has none, a recorder refuses one, or none answers for two minutes.
+/// If a recording is damaged, two have one id, a task has none, a recorder refuses one, or none answers for two minutes.
 pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::Result<()> {
     let all_tasks = recordings::tasks(folder)?;
     for task in tasks {
@@ -28,8 +28,12 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
         tasks.is_empty()
             || path.parent().and_then(Path::file_name).is_some_and(|name| tasks.iter().any(|t| name == &**t))
     };
+    let paths: Vec<_> = recordings::paths(folder)?.into_iter().filter(|path| wanted(path)).collect();
+    if let Some(duplicate) = recordings::duplicates(&paths).into_iter().next() {
+        bail!(duplicate);
+    }
     let mut sent = 0;
-    for path in recordings::paths(folder)?.into_iter().filter(|path| wanted(path)) {
+    for path in paths {
         let (place, reading) = (folder.to_owned(), path.clone());
         let episode = tokio::task::spawn_blocking(move || recordings::read(&place, &reading)).await??;
         send(session, &episode).await.with_context(|| path.display().to_string())?;

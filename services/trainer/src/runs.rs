@@ -10,6 +10,7 @@ use futures::{Stream, stream};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
@@ -45,6 +46,8 @@ pub struct Config {
 #[derive(Debug, Clone)]
 pub struct Runs {
     config: Arc<Config>,
+    /// Held until the shutdown: two services would each know a part of the runs.
+    lock: Arc<Mutex<Option<File>>>,
     runs: watch::Sender<BTreeMap<String, Run>>,
     /// What stops each run that runs.
     stops: Arc<Mutex<HashMap<String, CancellationToken>>>,
@@ -63,12 +66,11 @@ impl Runs {
     /// Reads which runs there are.
     ///
     /// # Errors
-    /// If the folder cannot be made or read.
+    /// If the folder cannot be made or read, or another process has it.
     pub fn open(config: Config) -> anyhow::Result<Self> {
-        std::fs::create_dir_all(&config.folder)?;
+        let lock = files::take_over(&config.folder)?;
         let mut runs = BTreeMap::new();
-        for entry in std::fs::read_dir(&config.folder)? {
-            let folder = entry?.path();
+        for folder in files::list(&config.folder)? {
             match load(&folder) {
                 Ok(Some(Kept { run, .. })) => drop(runs.insert(run.name.clone(), run)),
                 Ok(None) => {}
@@ -77,6 +79,7 @@ impl Runs {
         }
         Ok(Self {
             config: Arc::new(config),
+            lock: Arc::new(Mutex::new(Some(lock))),
             runs: watch::Sender::new(runs),
             stops: Arc::default(),
             shutdown: CancellationToken::new(),
@@ -98,6 +101,7 @@ impl Runs {
         if self.shutdown.is_cancelled() {
             return Err(Error::new(Code::Unavailable, "service", "one that runs", "one that shuts down"));
         }
+        self.forget_removed();
         let known = self.runs.borrow().get(name).cloned();
         if let Some(RunState::Running | RunState::Finished { .. }) = known.as_ref().map(|run| &run.state) {
             let got = known.map(|run| run.state.name()).unwrap_or_default();
@@ -155,8 +159,9 @@ impl Runs {
         self.get(name)
     }
 
-    /// Every run, by name.
+    /// Every run, by name; those whose folders were removed are not, unless they run.
     pub fn list(&self) -> Vec<Run> {
+        self.forget_removed();
         self.runs.borrow().values().cloned().collect()
     }
 
@@ -195,6 +200,18 @@ impl Runs {
             info!(running, "stopping runs");
         }
         self.tasks.wait().await;
+        drop(self.lock.lock().unwrap_or_else(PoisonError::into_inner).take());
+    }
+
+    /// Forgets the runs whose folders somebody removed, so that they can be started anew.
+    fn forget_removed(&self) {
+        let is_there =
+            |run: &Run| run.state == RunState::Running || self.config.folder.join(&run.name).join(STATE).exists();
+        self.runs.send_if_modified(|runs| {
+            let before = runs.len();
+            runs.retain(|_, run| is_there(run));
+            runs.len() < before
+        });
     }
 
     fn get(&self, name: &str) -> Result<Run, Error> {

@@ -69,6 +69,7 @@ pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Repor
             Err(fault) => faults.push(format!("{fault:#} (remove the file and record it again)")),
         }
     }
+    faults.extend(recordings::duplicates(&paths));
     if by_task.len() < tasks {
         faults.push(format!("expected at least {tasks} tasks, got {}", by_task.len()));
     }

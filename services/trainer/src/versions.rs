@@ -56,8 +56,7 @@ impl Versions {
         let folder = checkpoints.join(VERSIONS);
         let lock = files::take_over(&folder)?;
         let mut histories = BTreeMap::new();
-        for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
-            let folder = entry?.path();
+        for folder in files::list(&folder)? {
             if folder.is_dir()
                 && let Some(history) = History::read(&folder).with_context(|| folder.display().to_string())?
             {
@@ -82,8 +81,7 @@ impl Versions {
     /// If the folder cannot be read.
     pub fn take_in(&self) -> anyhow::Result<()> {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        for entry in std::fs::read_dir(&self.checkpoints).with_context(|| self.checkpoints.display().to_string())? {
-            let path = entry?.path();
+        for path in files::list(&self.checkpoints)? {
             // Before the file is read: if it is replaced in between, it is looked at once more.
             let (Some(model), Ok(metadata)) = (history::stem(&path), path.metadata()) else { continue };
             let signed = signature::path(&path).metadata().ok();
@@ -125,6 +123,11 @@ impl Versions {
         let last = history.manifests().last();
         if last.is_some_and(|last| last.digest == checkpoint.digest) {
             let digest = checkpoint.digest;
+            let weights = history::weights(&self.folder(model), &digest);
+            if !history::is_whole(&weights, &digest) {
+                warn!(model, digest, "weights were not what they were; written again");
+                files::write_atomically(&weights, bytes).map_err(|e| unwritten(&e))?;
+            }
             if signature.is_some_and(|bundle| history.sign(&digest, &bundle)) {
                 self.store(&mut histories, model, history)?;
                 info!(model, digest, "signature added");
@@ -146,7 +149,7 @@ impl Versions {
         self.commit(&mut histories, model, history).map(drop)
     }
 
-    /// The versions of a model, or of all.
+    /// The versions of a model, or of all, whose weights are on disk.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown model.
@@ -157,7 +160,8 @@ impl Versions {
             None => histories.values().collect(),
         };
         let versions = wanted.into_iter().flat_map(|history| {
-            history.manifests().iter().map(|manifest| {
+            let kept = history.manifests().iter().filter(|manifest| self.is_there(manifest));
+            kept.map(|manifest| {
                 let promoted = history.promoted()?.version == manifest.version;
                 Ok(CheckpointVersion { manifest: manifest.clone(), promoted })
             })
@@ -168,7 +172,8 @@ impl Versions {
     /// Lets planners serve a version that is kept.
     ///
     /// # Errors
-    /// `NOT_FOUND` for an unknown model or version; `INTERNAL` if it cannot be written.
+    /// `NOT_FOUND` for an unknown model or version; `FAILED_PRECONDITION` if its weights are gone or damaged; `INTERNAL` if
+    /// it cannot be written.
     pub fn promote(&self, request: PromoteVersionRequest) -> Result<PromoteVersionResponse, Error> {
         let PromoteVersionRequest { model, version } = request;
         let mut histories = self.histories();
@@ -178,14 +183,15 @@ impl Versions {
             return Err(Error::new(Code::NotFound, "version", format!("one of {kept:?}"), version));
         }
         history.promote(version);
+        self.check_whole(&history)?;
         Ok(PromoteVersionResponse { manifest: self.commit(&mut histories, &model, history)? })
     }
 
     /// Lets planners serve the version that was promoted before the one that is.
     ///
     /// # Errors
-    /// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no other that is kept was promoted; `INTERNAL` if it
-    /// cannot be written.
+    /// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no other that is kept was promoted, or its weights are gone
+    /// or damaged; `INTERNAL` if it cannot be written.
     pub fn roll_back(&self, RollBackRequest { model }: RollBackRequest) -> Result<RollBackResponse, Error> {
         let mut histories = self.histories();
         let mut history = find(&histories, &model)?.clone();
@@ -193,6 +199,7 @@ impl Versions {
             let expected = "one of which another version that is kept was promoted before";
             return Err(Error::new(Code::FailedPrecondition, "model", expected, model));
         }
+        self.check_whole(&history)?;
         Ok(RollBackResponse { manifest: self.commit(&mut histories, &model, history)? })
     }
 
@@ -243,6 +250,23 @@ impl Versions {
         let manifest = announcement.manifest.clone();
         self.promoted.send_modify(|promoted| drop(promoted.insert(model.to_owned(), announcement)));
         Ok(manifest)
+    }
+
+    /// Whether a version's weights are on disk, by their size.
+    fn is_there(&self, CheckpointManifest { model, digest, size_bytes, .. }: &CheckpointManifest) -> bool {
+        let weights = history::weights(&self.folder(model), digest);
+        weights.metadata().is_ok_and(|metadata| metadata.len() == *size_bytes)
+    }
+
+    /// Checks that the weights of what is to be promoted are on disk as they were: planners will ask for them.
+    fn check_whole(&self, history: &History) -> Result<(), Error> {
+        let CheckpointManifest { model, version, digest, .. } = history.promoted()?;
+        let weights = history::weights(&self.folder(model), digest);
+        if history::is_whole(&weights, digest) {
+            return Ok(());
+        }
+        let got = format!("{version}, whose file {} is gone or damaged", weights.display());
+        Err(Error::new(Code::FailedPrecondition, "version", "one whose weights are kept", got))
     }
 
     fn folder(&self, model: &str) -> PathBuf {

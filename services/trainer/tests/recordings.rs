@@ -191,13 +191,106 @@ fn a_recording_in_the_place_of_another_is_not_taken_for_it() {
     assert_eq!(recordings.read("reach-2").unwrap(), Some(episode("reach", 2, 5)));
 }
 
+/// "Kept" is said of what is on disk and whole, also while the recorder is up.
+#[test]
+fn a_recording_that_was_cut_or_removed_is_recorded_again() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let (path, whole) = (folder.path().join("reach/reach-2.mcap"), episode("reach", 2, 5));
+    let bytes = std::fs::read(&path).unwrap();
+    let cut = &bytes[..bytes.len() / 2];
+    assert!(recording::read_header(&path).is_ok_and(|info| info == *whole.info()));
+
+    std::fs::write(&path, cut).unwrap();
+    assert!(recording::read_header(&path).is_ok(), "its header is whole");
+    let recordings = Recordings::open(folder.path().to_owned()).unwrap();
+    type Damage<'a> = Box<dyn Fn() + 'a>;
+    let damages: [Damage; 4] = [
+        Box::new(|| ()),
+        Box::new(|| std::fs::write(&path, cut).unwrap()),
+        Box::new(|| std::fs::remove_file(&path).unwrap()),
+        Box::new(|| std::fs::rename(&path, folder.path().join("push/reach-2.mcap")).unwrap()),
+    ];
+    for (index, damage) in damages.iter().enumerate() {
+        damage();
+        let kept = recordings.all();
+        assert_eq!((recordings.count(), kept.iter().any(|info| info.episode_id == "reach-2")), (2, false), "{index}");
+        assert_eq!((recordings.get("reach-2"), recordings.contains("reach-2")), (None, false), "{index}");
+        assert_eq!(recordings.read("reach-2").unwrap(), None, "{index}");
+        assert_eq!(recordings.lacks(whole.info()), Ok(true), "{index}");
+        recordings.keep(&whole).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), bytes, "{index}");
+        assert_eq!(recordings.get("reach-2").as_ref(), Some(whole.info()), "{index}");
+    }
+}
+
+/// What others put into the folder is not written over, and what they took away no longer decides how frames are rendered.
+#[test]
+fn a_recorder_sees_what_others_do_in_its_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = Recordings::open(folder.path().to_owned()).unwrap();
+    recordings.keep(&episode("reach", 0, 3)).unwrap();
+    let copied = recording::to_bytes(&episode("reach", 1, 3)).unwrap();
+    let path = folder.path().join("reach/reach-1.mcap");
+    std::fs::write(&path, &copied).unwrap();
+    let error = recordings.keep(&episode("reach", 1, 4)).unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (Code::FailedPrecondition, "digest"));
+    assert_eq!((std::fs::read(&path).unwrap(), recordings.count()), (copied, 2));
+
+    let mut others = steps("push", 3, 4);
+    others.iter_mut().for_each(|step| step.frame = step.frame.clone().rendered_as("other").unwrap());
+    let other = Episode::new(info("push", 3, &others), others).unwrap();
+    assert_eq!(recordings.keep(&other).unwrap_err().field, "render_spec");
+    std::fs::remove_dir_all(folder.path().join("reach")).unwrap();
+    recordings.keep(&other).unwrap();
+    assert_eq!(recordings.all(), [other.info().clone()]);
+}
+
+/// By its id a recording is told from others, by every reader.
+#[test]
+fn two_recordings_of_one_id_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let mut info = info("push", 2, &episode("reach", 2, 5).into_steps());
+    info.episode_id = "reach-2".into();
+    let twin = Episode::new(info, episode("reach", 2, 5).into_steps()).unwrap();
+    std::fs::write(folder.path().join("push/reach-2.mcap"), recording::to_bytes(&twin).unwrap()).unwrap();
+    let found = "reach/reach-2.mcap: expected an id that no other episode has, got that of ";
+    let faults = verify::run(folder.path(), 1, 1).unwrap().faults;
+    assert!(matches!(&faults[..], [fault] if fault.contains(found)), "{faults:?}");
+    let error = Dataset::load(folder.path(), &[], Input::Image).unwrap_err().to_string();
+    assert!(error.contains(found), "{error}");
+    Dataset::load(folder.path(), &["push".into()], Input::Image).unwrap();
+    assert_eq!(Recordings::open(folder.path().to_owned()).unwrap().count(), 3);
+}
+
+/// Other programs leave files where recordings are kept.
+#[test]
+fn files_that_come_along_are_nobodys() {
+    let folder = tempfile::tempdir().unwrap();
+    dataset(folder.path());
+    let before = (verify::run(folder.path(), 1, 1).unwrap().digest, files(folder.path()));
+    for stray in ["reach/._reach-0.mcap", ".Trash-1000/reach-0.mcap", "lost+found/reach-0.mcap", "._push"] {
+        let stray = folder.path().join(stray);
+        std::fs::create_dir_all(stray.parent().unwrap()).unwrap();
+        std::fs::write(stray, "not a recording").unwrap();
+    }
+    let report = verify::run(folder.path(), 1, 1).unwrap();
+    assert_eq!((report.faults, report.tasks.len(), (report.digest, files(folder.path()))), (vec![], 2, before));
+    assert_eq!(Dataset::load(folder.path(), &[], Input::Image).unwrap().tasks().len(), 2);
+    assert_eq!(Recordings::open(folder.path().to_owned()).unwrap().count(), 3);
+    let error = format!("{:#}", verify::run(&folder.path().join("absent"), 1, 1).unwrap_err());
+    assert!(error.contains("absent"), "{error}");
+}
+
 #[test]
 fn a_folder_has_one_keeper_and_an_id_one_episode() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let recordings = Recordings::open(folder.path().to_owned()).unwrap();
     let error = Recordings::open(folder.path().to_owned()).unwrap_err();
-    assert!(error.to_string().ends_with("expected a folder that no process keeps"), "{error}");
+    let (error, keeper) = (format!("{error:#}"), format!("got that of process {} (", std::process::id()));
+    assert!(error.contains("expected one that no process keeps") && error.contains(&keeper), "{error}");
 
     let kept = recordings.get("reach-0").unwrap();
     assert_eq!(recordings.lacks(&kept), Ok(false));

@@ -357,3 +357,31 @@ async fn a_run_outlasts_the_service() {
     assert_eq!(steps, (1..=400).collect::<Vec<_>>());
     fixture.service.shutdown().await.unwrap();
 }
+
+/// What is said of runs is said of their folders, which belong to one service.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_whose_folder_was_removed_is_started_anew() {
+    let folder = folder();
+    let fixture = Fixture::start(folder.path()).await;
+    for client in fixture.clients() {
+        client.start(request("run", SHORT)).await.unwrap();
+        client.to_the_end("run").await;
+        let again = client.start(request("run", SHORT)).await.unwrap_err();
+        assert_eq!((again.code, again.field.as_str()), (Code::FailedPrecondition, "name"), "{}", client.transport());
+        std::fs::remove_dir_all(folder.path().join("runs/run")).unwrap();
+        assert_eq!(client.list().await.unwrap(), [], "{}", client.transport());
+    }
+    // What others leave there is no run, damaged or not.
+    std::fs::create_dir(folder.path().join("runs/.Trash-1000")).unwrap();
+    let config = trainer::runs::Config {
+        folder: folder.path().join("runs"),
+        dataset: folder.path().join("data"),
+        checkpoints: folder.path().join("checkpoints"),
+        max_runs: 1,
+        program: env!("CARGO_BIN_EXE_cpn-trainer").into(),
+    };
+    let error = format!("{:#}", Runs::open(config.clone()).unwrap_err());
+    assert!(error.contains("expected one that no process keeps, got that of process "), "{error}");
+    fixture.service.shutdown().await.unwrap();
+    assert_eq!(Runs::open(config).unwrap().list(), []);
+}

@@ -200,7 +200,7 @@ fn a_restart_changes_nothing() {
     let (before, listed_before) = (announced(&versions), listed(&versions));
     assert_eq!(listed_before, (vec![1, 2, 3], 2));
     let error = Versions::open(folder.path().to_owned(), NonZeroU16::MIN).unwrap_err();
-    assert!(format!("{error:#}").contains("expected a folder that no process keeps"), "{error:#}");
+    assert!(format!("{error:#}").contains("expected one that no process keeps"), "{error:#}");
     drop(versions);
 
     // What a process leaves that was killed before the history knew of it.
@@ -269,6 +269,50 @@ fn damaged_versions_give_way() {
     std::fs::write(folder.path().join("versions/cpn/history.json"), b"{").unwrap();
     let error = format!("{:#}", Versions::open(folder.path().to_owned(), NonZeroU16::MIN).unwrap_err());
     assert!(error.contains("versions/cpn: history.json: EOF"), "{error}");
+}
+
+/// What is said of versions holds of the weights on disk, also while the process runs that keeps them.
+#[test]
+fn weights_that_went_are_not_promoted_and_come_back() {
+    let folder = TempDir::new().unwrap();
+    let versions = open(&folder, 5);
+    for seed in 1..=2 {
+        versions.publish("cpn", &checkpoint(seed)).unwrap();
+    }
+    let path = |seed: u64| {
+        let digest = cpn::checkpoint::digest(&checkpoint(seed));
+        folder.path().join(format!("versions/cpn/{digest}.safetensors"))
+    };
+    let before = announced(&versions);
+    let mut damaged = checkpoint(1);
+    damaged[200] ^= 1;
+    std::fs::write(path(1), damaged).unwrap();
+    for refused in [promote(&versions, 1).map(drop), roll_back(&versions).map(drop)] {
+        let error = refused.unwrap_err();
+        assert_eq!((error.code, error.field.as_str()), (Code::FailedPrecondition, "version"));
+        assert!(error.got.contains(&path(1).display().to_string()), "{error}");
+    }
+    std::fs::remove_file(path(1)).unwrap();
+    assert_eq!((announced(&versions), listed(&versions)), (before.clone(), (vec![2], 2)));
+
+    std::fs::remove_file(path(2)).unwrap();
+    versions.publish("cpn", &checkpoint(2)).unwrap();
+    assert_eq!(fetched(&versions, &before.manifest), checkpoint(2));
+}
+
+#[test]
+fn files_that_come_along_are_nobodys() {
+    let folder = TempDir::new().unwrap();
+    let versions = open(&folder, 5);
+    std::fs::write(folder.path().join("._cpn.safetensors"), checkpoint(1)).unwrap();
+    std::fs::create_dir(folder.path().join("lost+found")).unwrap();
+    versions.take_in().unwrap();
+    assert!(versions.promoted().borrow().is_empty());
+    drop(versions);
+    let trash = folder.path().join("versions/.Trash-1000");
+    std::fs::create_dir(&trash).unwrap();
+    std::fs::write(trash.join("history.json"), "{").unwrap();
+    open(&folder, 5);
 }
 
 #[test]
