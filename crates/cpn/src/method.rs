@@ -1,6 +1,7 @@
 //! The compared methods behind one interface (section "Methods for comparison").
 
 use crate::config::Input;
+use crate::fused::{Descent, Sampling};
 use crate::{images, positions};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -31,6 +32,19 @@ pub trait Method: Send {
 
     /// Plans for each query, all by the same search. A plan does not depend, in any bit, on what else is planned for.
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;
+
+    /// Most queries that [`Method::resume`] takes together, for [`Solver::Gradient`]; for the other solvers it is one.
+    fn together(&self) -> usize {
+        1
+    }
+
+    /// Goes on with a search for queries, always the same, until it is over or `go_on`, which is asked after each piece, says no;
+    /// at least one piece is done. The first is where the search begins, and `go_on` is not asked after it. A method that knows no
+    /// pieces does all at once.
+    fn resume(&mut self, queries: &[Query<'_>], ongoing: &mut Ongoing, _go_on: &mut dyn FnMut() -> bool) {
+        let iterations = Iterations::Fixed(ongoing.iterations);
+        ongoing.state = State::Whole(self.plan(queries, &mut Search { solver: ongoing.solver, iterations }));
+    }
 }
 
 /// An observation or a goal.
@@ -99,6 +113,93 @@ pub enum Iterations<'a> {
     Fixed(usize),
     /// Once the answer is no.
     While(&'a mut dyn FnMut() -> bool),
+}
+
+/// A search that can be left and taken up again, by [`Method::resume`]. In which pieces it is done changes no bit of the plans,
+/// which are those of [`Method::plan`].
+#[derive(Debug)]
+pub struct Ongoing {
+    pub(crate) solver: Solver,
+    pub(crate) iterations: usize,
+    pub(crate) keep_best: bool,
+    pub(crate) state: State,
+}
+
+/// How far a search has come.
+#[derive(Debug)]
+pub(crate) enum State {
+    New,
+    /// One for each thread.
+    Descents(Vec<Descent>),
+    Sampling(Sampling),
+    /// It was done at once.
+    Whole(Vec<Plan>),
+}
+
+impl Ongoing {
+    /// A search of so many iterations. If it may end sooner, the best plan counts, else the last of [`Solver::Gradient`].
+    pub fn new(solver: Solver, iterations: usize, may_end_sooner: bool) -> Self {
+        Self { solver, iterations, keep_best: may_end_sooner, state: State::New }
+    }
+
+    /// Which way it is searched.
+    pub fn solver(&self) -> Solver {
+        self.solver
+    }
+
+    /// Whether all iterations were made.
+    pub fn is_over(&self) -> bool {
+        match &self.state {
+            State::New => false,
+            State::Descents(descents) => descents.iter().all(|descent| descent.done >= self.iterations),
+            State::Sampling(sampling) => sampling.done >= self.iterations,
+            State::Whole(_) => true,
+        }
+    }
+
+    /// Rollouts so far, of all queries together: what a search takes grows with them.
+    pub fn rollouts(&self) -> usize {
+        match &self.state {
+            State::New => 0,
+            State::Descents(descents) => descents.iter().map(|descent| (descent.done + 1) * descent.plans.len()).sum(),
+            State::Sampling(sampling) => sampling.rollouts,
+            State::Whole(plans) => rollouts(self.solver, self.iterations) * plans.len(),
+        }
+    }
+
+    /// Leaves out a query, by its place among those that are left.
+    pub fn remove(&mut self, mut index: usize) {
+        match &mut self.state {
+            State::Descents(descents) => {
+                for descent in descents {
+                    if index < descent.plans.len() {
+                        return descent.remove(index);
+                    }
+                    index -= descent.plans.len();
+                }
+            }
+            State::Whole(plans) => drop(plans.remove(index)),
+            State::New | State::Sampling(_) => {}
+        }
+    }
+
+    /// The plans so far; none of a search that was not begun.
+    pub fn into_plans(self) -> Vec<Plan> {
+        match self.state {
+            State::New => Vec::new(),
+            State::Descents(descents) => descents.into_iter().flat_map(|descent| descent.plans).collect(),
+            State::Sampling(sampling) => vec![sampling.into_plan()],
+            State::Whole(plans) => plans,
+        }
+    }
+}
+
+/// Rollouts that a search of so many iterations makes: of [`Solver::Gradient`] there and back.
+pub fn rollouts(solver: Solver, iterations: usize) -> usize {
+    match solver {
+        Solver::Gradient => iterations + 1,
+        Solver::Cem(samples) | Solver::Mppi(samples) | Solver::Hybrid(samples) => iterations * samples + 1,
+    }
 }
 
 /// Ways to search for the actions whose predicted end is nearest to the goal.

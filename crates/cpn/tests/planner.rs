@@ -8,7 +8,7 @@ use common::{double_agent, encoders, noise_images, position_config, small_config
 use cpn::encoder::Precision;
 use cpn::images;
 use cpn::inner_loop::TensorPlan;
-use cpn::method::{Iterations, Observed, Query, Search, Solver};
+use cpn::method::{self, Iterations, Observed, Ongoing, Query, Search, Solver};
 use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Plan, Planner, Preset, Random};
 use proptest::prelude::*;
 use tch::{Kind, Tensor};
@@ -267,6 +267,81 @@ fn a_search_goes_on_while_it_may_and_answers_the_best() {
     }
     let plain = search(&mut planner, Solver::Gradient, Iterations::Fixed(7), &[]);
     assert!(!plain.inner_losses.is_sorted_by(|a, b| a >= b), "the step must overshoot for this test to say anything");
+}
+
+/// The same bits, in whatever pieces, on however many threads, with other work in the same memory between any two pieces.
+#[test]
+fn a_search_in_pieces_is_that_in_one() {
+    let config = small_config(MethodKind::Cpn);
+    let ((x, _), (x_g, _)) = (embeddings(2, 6, 1), embeddings(2, 6, 2));
+    for (threads, start) in [(1, false), (3, true)] {
+        let (_, mut planner) = both(config.clone(), 40.0, threads);
+        let start =
+            if start { search(&mut planner, Solver::Cem(40), Iterations::Fixed(1), &[]).actions } else { vec![] };
+        let queries = queries(&x, &x_g, &start);
+        for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
+            let whole = planner.plan(&queries[..1], &mut fixed(solver, 5)).remove(0);
+            for pieces in [1, 2, 1000] {
+                let mut ongoing = Ongoing::new(solver, 5, false);
+                let mut times = 0;
+                while !ongoing.is_over() {
+                    let mut left = pieces;
+                    planner.resume(&queries[..1], &mut ongoing, &mut || {
+                        left -= 1;
+                        left > 0
+                    });
+                    planner.plan(&queries[1..], &mut fixed(Solver::Hybrid(3), 1));
+                    times += 1;
+                }
+                assert!(pieces > 2 || times > 2, "{solver:?}: {times} times of {pieces} pieces");
+                assert_eq!(ongoing.rollouts(), method::rollouts(solver, 5), "{solver:?}");
+                assert_eq!(ongoing.into_plans(), [whole.clone()], "{solver:?} in {pieces} pieces, {threads} threads");
+            }
+        }
+    }
+}
+
+/// Those that are searched for together do not notice when one of them is left out.
+#[test]
+fn a_search_goes_on_without_those_that_have_left() {
+    for threads in [1, 3] {
+        let (_, mut planner) = both(small_config(MethodKind::Cpn), 0.5, threads);
+        let ((x, _), (x_g, _)) = (embeddings(7, 6, 1), embeddings(7, 6, 2));
+        let mut queries = queries(&x, &x_g, &[]);
+        let mut expected = planner.plan(&queries, &mut fixed(Solver::Gradient, 9));
+        let mut ongoing = Ongoing::new(Solver::Gradient, 9, false);
+        // One of three threads has nothing left in the end.
+        for gone in [6, 2, 4, 0, 0] {
+            planner.resume(&queries, &mut ongoing, &mut || false);
+            queries.remove(gone);
+            expected.remove(gone);
+            ongoing.remove(gone);
+        }
+        while !ongoing.is_over() {
+            planner.resume(&queries, &mut ongoing, &mut || true);
+        }
+        assert_eq!(ongoing.into_plans(), expected, "{threads} threads");
+    }
+}
+
+/// A search that is left for good answers the best plan of what it has done whole, as one of so many iterations does.
+#[test]
+fn a_search_that_is_left_answers_the_best_so_far() {
+    let (_, mut planner) = both(small_config(MethodKind::Cpn), 40.0, 1);
+    let ((x, _), (x_g, _)) = (embeddings(1, 6, 1), embeddings(1, 6, 2));
+    let queries = queries(&x, &x_g, &[]);
+    for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
+        let mut ongoing = Ongoing::new(solver, 1000, true);
+        for _ in 0..12 {
+            planner.resume(&queries, &mut ongoing, &mut || false);
+        }
+        assert!(!ongoing.is_over());
+        let plan = ongoing.into_plans().remove(0);
+        assert!(plan.inner_losses.is_sorted_by(|a, b| a >= b), "{solver:?}: {:?}", plan.inner_losses);
+        assert!(plan.inner_losses.len() > 2, "{solver:?}: {:?}", plan.inner_losses);
+        let again = planner.plan(&queries, &mut fixed(solver, plan.iterations)).remove(0);
+        assert_eq!(again.actions, plan.actions, "{solver:?}");
+    }
 }
 
 #[test]

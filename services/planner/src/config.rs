@@ -24,6 +24,8 @@ pub struct Config {
     pub queue_capacity: NonZeroU16,
     /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
     pub goal_capacity: NonZeroU16,
+    /// Most models that are served, `random` among them; one more is refused.
+    pub model_capacity: NonZeroU16,
     /// Most checkpoints of a model that are kept after they were swapped out, for episodes that began with them; the least
     /// recently used go first.
     pub retired_capacity: NonZeroU16,
@@ -61,6 +63,7 @@ impl Default for Config {
             openpi_listen: None,
             queue_capacity: count(64),
             goal_capacity: count(1024),
+            model_capacity: count(32),
             retired_capacity: count(3),
             batch_size: count(64),
             batch_delay_ms: 0,
@@ -124,6 +127,10 @@ pub struct Args {
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub goal_capacity: Option<NonZeroU16>,
+    /// Most models that are served, `random` among them [default: 32].
+    #[arg(long, value_name = "COUNT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub model_capacity: Option<NonZeroU16>,
     /// Most checkpoints of a model that are kept after they were swapped out [default: 3].
     #[arg(long, value_name = "COUNT")]
     #[serde(skip_serializing_if = "Option::is_none")]

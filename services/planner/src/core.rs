@@ -191,6 +191,11 @@ impl PlannerCore {
         ListModelsResponse { models: self.thread.models().values().cloned().collect() }
     }
 
+    /// Answers searches that go on with an error.
+    pub(crate) fn give_up(&self) {
+        self.thread.give_up();
+    }
+
     /// Finishes the plans that are waiting; refuses every later request.
     pub(crate) async fn stop(&self) {
         self.thread.stop().await;

@@ -14,6 +14,7 @@ pub mod model;
 mod model_thread;
 mod openpi;
 mod owner;
+mod searches;
 mod served;
 mod signatures;
 mod task;
@@ -115,6 +116,8 @@ impl Planner {
         })
         .await;
         zenoh.close().await?;
+        // A search that goes on has nobody to answer any more.
+        core.give_up();
         drained.unwrap_or_else(|_| {
             warn!("requests in flight were given up after {} s", DRAIN_TIMEOUT.as_secs());
             Ok(())

@@ -1,28 +1,28 @@
 //! A model as it is served, and what is checked before it is.
 
+use crate::load::{Costs, resolve};
 use crate::signatures::Signatures;
-use crate::task::PlanTask;
+use crate::task::{Answer, PlanTask};
 use cpn::checkpoint::{self, Checkpoint, Provenance};
 use cpn::encoder::Precision;
-use cpn::method::{self, Iterations, Observed, Query};
+use cpn::method::{self, Iterations, Observed, Ongoing, Query, Solver};
 use cpn::{Input, Method, Plan, Planner, Random, images};
 use service_kit::files;
 use std::fmt;
 use std::io;
 use std::num::NonZeroU16;
 use std::path::Path;
+use std::time::Instant;
 use wire::checkpoint::CheckpointManifest;
-use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo, Search, Solver};
+use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo, PlanResponse, Search, StageTimes};
 use wire::{Code, Error, Observation};
 
 /// Name of the control of every comparison, always served.
 pub const RANDOM: &str = "random";
 /// A of the control: hand displacement x, y, z and gripper effort.
 const RANDOM_ACTIONS: usize = 4;
-/// Plans in a generation, if a request does not say.
-const SAMPLES: u32 = 64;
-/// Generations, likewise.
-const GENERATIONS: u32 = 4;
+/// Plans that are tried to see what that costs.
+const TRIALS: usize = 32;
 
 /// What models compute with.
 #[derive(Debug, Clone, Copy)]
@@ -39,26 +39,23 @@ pub struct Model {
     pub render_spec: String,
     /// What plans.
     pub method: Box<dyn Method>,
-}
-
-/// A plan, whose numbers are all finite.
-#[derive(Debug)]
-pub(crate) struct Planned {
-    pub(crate) plan: Plan,
-    /// Euclidean; none if Z is 0.
-    pub(crate) latent_distance: Option<f32>,
+    /// What its plans cost, as far as that is known.
+    pub(crate) costs: Costs,
 }
 
 impl Model {
+    /// A method that is served as `info` says.
+    pub fn new(info: ModelInfo, render_spec: String, method: Box<dyn Method>) -> Self {
+        let costs = Costs::new(&info.digest, method.updates().unwrap_or_default());
+        Self { info, render_spec, method, costs }
+    }
+
     /// Uniform actions, whatever the images show.
     pub(crate) fn random() -> Self {
         let method = Random { actions: RANDOM_ACTIONS };
         let digest = checkpoint::digest(RANDOM.as_bytes());
-        Self {
-            info: info(RANDOM.to_owned(), 0, &method, digest, Vec::new()),
-            render_spec: String::new(),
-            method: Box::new(method),
-        }
+        let info = info(RANDOM.to_owned(), 0, &method, digest, Vec::new());
+        Self::new(info, String::new(), Box::new(method))
     }
 
     /// Reads a checkpoint, from the bytes or from a file in `folder`, and tries it once. Blocks.
@@ -113,13 +110,13 @@ impl Model {
         let threads = usize::from(computing.threads.get());
         let method: Box<dyn Method> = Box::new(Planner::new(loaded.agent, computing.precision, threads));
         let info = info(name, version, &*method, loaded.digest, training_tasks);
-        let mut model = Self { info, render_spec, method };
+        let mut model = Self::new(info, render_spec, method);
         model.warm_up()?;
         Ok(model)
     }
 
-    /// Plans once, from black to white or from one corner of space to another: the first request does not pay for it, and
-    /// weights that are finite but lead to plans that are not are found out.
+    /// Plans, from black to white or from one corner of space to another: the first request does not pay for it, weights that are
+    /// finite but lead to plans that are not are found out, and what plans cost is known.
     fn warm_up(&mut self) -> Result<(), Error> {
         let (black, white) = (vec![0; images::BYTES], vec![u8::MAX; images::BYTES]);
         let ends = if self.method.takes(Input::Image) {
@@ -127,10 +124,22 @@ impl Model {
         } else {
             [-1.0, 1.0].map(|metres| Observed::Position([metres; 3]))
         };
+        let started = Instant::now();
         let ends = self.method.encode(&ends);
-        let queries = [Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] }];
-        let planned = self.plan(&queries, None, || false).remove(0);
-        planned.map(drop).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))
+        self.costs.embedded(2, started.elapsed());
+        let query = Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] };
+        let updates = self.method.updates();
+        let trials = updates.map(|_| (Solver::Cem(TRIALS), 1));
+        let plans = [Some((Solver::Gradient, updates.unwrap_or_default())), trials];
+        // Twice, as the first time is like no other.
+        for (solver, iterations) in plans.into_iter().flatten().flat_map(|plan| [plan, plan]) {
+            let (started, iterations_left) = (Instant::now(), Iterations::Fixed(iterations));
+            let plan =
+                self.method.plan(&[query], &mut method::Search { solver, iterations: iterations_left }).remove(0);
+            self.costs.rolled_out(solver, method::rollouts(solver, iterations), started.elapsed());
+            check_plan(&plan, &query).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
+        }
+        Ok(())
     }
 
     /// Checks that the model can do what is asked of it.
@@ -178,42 +187,49 @@ impl Model {
         self.method.encode(&observed.collect::<Vec<_>>())
     }
 
-    /// Plans for each query. A search that goes on until the deadline asks `more` before each iteration.
+    /// Plans for each query.
+    pub(crate) fn plan(&mut self, queries: &[Query<'_>], search: Option<Search>) -> Vec<Plan> {
+        let (solver, iterations) = resolve(search, self.method.updates().unwrap_or_default());
+        self.method.plan(queries, &mut method::Search { solver, iterations: Iterations::Fixed(iterations) })
+    }
+
+    /// A search that is gone on with by [`Method::resume`].
+    pub(crate) fn begin(&self, search: Option<Search>) -> Ongoing {
+        let (solver, iterations) = resolve(search, self.method.updates().unwrap_or_default());
+        Ongoing::new(solver, iterations, search.is_some_and(|search| search.anytime))
+    }
+
+    /// What is answered to a task.
     ///
     /// # Errors
-    /// If any number of a plan is not finite.
-    pub(crate) fn plan(
-        &mut self,
-        queries: &[Query<'_>],
-        search: Option<Search>,
-        mut more: impl FnMut() -> bool,
-    ) -> Vec<Result<Planned, Error>> {
-        let solver = search.map_or(Solver::Gradient, |search| search.solver);
-        let samples = search.and_then(|search| search.samples).unwrap_or(SAMPLES) as usize;
-        let (solver, default) = match solver {
-            Solver::Gradient => (method::Solver::Gradient, self.method.updates().unwrap_or_default()),
-            Solver::Cem => (method::Solver::Cem(samples), GENERATIONS as usize),
-            Solver::Mppi => (method::Solver::Mppi(samples), GENERATIONS as usize),
-            Solver::Hybrid => (method::Solver::Hybrid(samples), GENERATIONS as usize),
-        };
-        let iterations = match search {
-            Some(search) if search.anytime => Iterations::While(&mut more),
-            _ => Iterations::Fixed(search.and_then(|search| search.iterations).map_or(default, |count| count as usize)),
-        };
-        let plans = self.method.plan(queries, &mut method::Search { solver, iterations });
-        plans.into_iter().zip(queries).map(|(plan, query)| Planned::new(plan, query)).collect()
+    /// If any number of the plan is not finite.
+    pub(crate) fn response(&self, task: &PlanTask, plan: Plan, query: &Query<'_>, times: StageTimes) -> Answer {
+        let latent_distance = check_plan(&plan, query)?;
+        let first_action = plan.actions.first().into_iter().flatten().map(|v| v.clamp(-1.0, 1.0)).collect();
+        let next = plan.actions.iter().skip(1).chain(plan.actions.last()).cloned();
+        Ok(PlanResponse {
+            first_action,
+            warm_start: if plan.inner_losses.is_empty() { Vec::new() } else { next.collect() },
+            iterations: plan.iterations as u32,
+            iterations_run: plan.inner_losses.len().saturating_sub(1) as u32,
+            actions: plan.actions,
+            inner_losses: plan.inner_losses,
+            latent_distance,
+            times,
+            model_digest: self.info.digest.clone(),
+            goal_id: task.goal_id.clone(),
+        })
     }
 }
 
-impl Planned {
-    fn new(plan: Plan, query: &Query<'_>) -> Result<Self, Error> {
-        let squares = query.x.iter().zip(query.x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
-        let latent_distance = (!query.x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);
-        check_finite("actions", plan.actions.iter().flatten())?;
-        check_finite("inner_losses", plan.inner_losses.iter())?;
-        check_finite("latent_distance", latent_distance.iter())?;
-        Ok(Self { plan, latent_distance })
-    }
+/// The Euclidean distance between a query's ends, none if Z is 0, if that and all numbers of its plan are finite.
+fn check_plan(plan: &Plan, query: &Query<'_>) -> Result<Option<f32>, Error> {
+    let squares = query.x.iter().zip(query.x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
+    let latent_distance = (!query.x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);
+    check_finite("actions", plan.actions.iter().flatten())?;
+    check_finite("inner_losses", plan.inner_losses.iter())?;
+    check_finite("latent_distance", latent_distance.iter())?;
+    Ok(latent_distance)
 }
 
 impl fmt::Debug for Model {

@@ -1,12 +1,13 @@
 //! The one thread that owns every model. What waits is planned together, as far as it can be.
 
 use crate::config::Config;
-use crate::load::Load;
-use crate::model::{Model, Planned};
+use crate::load::{Load, SLICE, resolve};
+use crate::model::Model;
 use crate::model_thread::Job;
+use crate::searches::Searches;
 use crate::served::Served;
-use crate::task::{Answer, PlanTask, Reply, Waiting, too_late};
-use cpn::method::Query;
+use crate::task::{Accepted, Answer, PlanTask, Waiting, too_late};
+use cpn::method::{Query, rollouts};
 use lru::LruCache;
 use metrics::{counter, histogram};
 use std::any::Any;
@@ -16,13 +17,11 @@ use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tracing::{debug_span, error};
-use wire::planner::{ModelInfo, PlanResponse, StageTimes};
+use wire::planner::{ModelInfo, StageTimes};
 use wire::{Code, Error};
 
-/// Most iterations of a search that goes on until its deadline.
-const MOST_ITERATIONS: usize = 1000;
-/// The part of a deadline that such a search may use; the answer must still be sent.
-const USABLE: f64 = 0.9;
+/// What plans that a request's search makes longer may take together, so that others need not wait for long.
+const BATCH: Duration = Duration::from_millis(20);
 
 /// The thread's side.
 pub(crate) struct Owner {
@@ -31,6 +30,7 @@ pub(crate) struct Owner {
     embeddings: Embeddings,
     /// Jobs that were taken from the channel and are not done yet, in order.
     queue: VecDeque<Job>,
+    searches: Searches,
     published: watch::Sender<BTreeMap<String, ModelInfo>>,
     load: Arc<Load>,
     batch_size: usize,
@@ -44,10 +44,16 @@ impl Owner {
         published: watch::Sender<BTreeMap<String, ModelInfo>>,
         load: Arc<Load>,
     ) -> Self {
+        let mut served = Served::new(config.model_capacity.get().into(), config.retired_capacity.into());
+        for model in models {
+            load.learn(&model.info.name, model.costs.clone());
+            served.swap_in(model).expect("as many as fit");
+        }
         Self {
-            models: Served::new(models, config.retired_capacity.into()),
+            models: served,
             embeddings: LruCache::new(config.goal_capacity.into()),
             queue: VecDeque::new(),
+            searches: Searches::default(),
             published,
             load,
             batch_size: config.batch_size.get().into(),
@@ -55,40 +61,77 @@ impl Owner {
         }
     }
 
-    /// Works until it is told to stop, or nobody is left to tell it anything.
+    /// Works until it is told to stop, or nobody is left to tell it anything. A search that takes long is gone on with between
+    /// other jobs, for as long as these take, or while there are none.
     pub(crate) fn run(mut self, jobs: &mpsc::Receiver<Job>) {
-        while let Some(job) = self.queue.pop_front().or_else(|| jobs.recv().ok()) {
+        loop {
+            let next = || if self.searches.is_empty() { jobs.recv().ok() } else { jobs.try_recv().ok() };
+            let job = self.queue.pop_front().or_else(next);
+            let (started, idle) = (Instant::now(), job.is_none());
             match job {
-                Job::Plan(first) => {
+                Some(Job::Plan(first)) => {
                     let batch = self.gather(first, jobs);
                     self.answer(batch);
                 }
-                Job::Serve { model, reply } => {
-                    let (name, info) = (model.info.name.clone(), model.info.clone());
-                    self.models.swap_in(model);
-                    self.published.send_modify(|infos| drop(infos.insert(name, info)));
-                    let _ = reply.send(());
+                Some(Job::Serve { model, reply }) => drop(reply.send(self.serve(model))),
+                Some(Job::Unload { model, reply }) => drop(reply.send(self.unload(&model))),
+                None if self.searches.is_empty() => return,
+                Some(Job::Stop) => {
+                    while !self.searches.is_empty() {
+                        self.go_on(SLICE);
+                    }
+                    return;
                 }
-                Job::Stop => return,
+                None => {}
             }
+            if !self.searches.is_empty() {
+                self.go_on(if idle { SLICE } else { started.elapsed().min(SLICE) });
+            }
+        }
+    }
+
+    fn serve(&mut self, model: Model) -> Result<(), Error> {
+        let (info, costs) = (model.info.clone(), model.costs.clone());
+        self.models.swap_in(model)?;
+        self.load.learn(&info.name, costs);
+        self.published.send_modify(|infos| drop(infos.insert(info.name.clone(), info)));
+        Ok(())
+    }
+
+    fn unload(&mut self, model: &str) -> Result<(), Error> {
+        self.models.remove(model)?;
+        self.load.forget(model);
+        self.published.send_modify(|infos| drop(infos.remove(model)));
+        Ok(())
+    }
+
+    fn go_on(&mut self, share: Duration) {
+        for (accepted, answer) in self.searches.go_on(&self.load, share) {
+            self.reply(accepted, answer);
         }
     }
 
     /// What can be planned with the first: the tasks like it that wait, up to the next swap, as long as none would be late for
     /// the others' sake.
     fn gather(&mut self, first: Waiting, jobs: &mpsc::Receiver<Job>) -> Vec<Waiting> {
-        let most = if first.task.is_anytime() { 1 } else { self.batch_size };
+        // Plans are tried on all threads, and a search that is over when others wait has nobody beside it.
+        let alone = first.task.is_anytime() || first.task.is_sampled();
+        let most = if alone { 1 } else { self.batch_size.min(self.together(&first)) };
         self.listen(&first.task, most, jobs);
         let swap = self.queue.iter().position(|job| !matches!(job, Job::Plan(_))).unwrap_or(self.queue.len());
         let after = self.queue.split_off(swap);
         let mut due = first.due();
+        let mut time = Load::time(first.estimate);
         let (mut batch, mut rest) = (vec![first], VecDeque::new());
         for job in self.queue.drain(..) {
             match job {
                 Job::Plan(waiting) if batch.len() < most && waiting.task.is_like(&batch[0].task) => {
                     let earliest = due.into_iter().chain(waiting.due()).min();
-                    if earliest.is_none_or(|due| Instant::now() + self.load.time(batch.len() + 1) <= due) {
-                        due = earliest;
+                    let together = time + Load::time(waiting.estimate);
+                    let in_time = earliest.is_none_or(|due| Instant::now() + together <= due);
+                    let short = waiting.estimate.long || waiting.task.search.is_none() || together <= BATCH;
+                    if in_time && short {
+                        (due, time) = (earliest, together);
                         batch.push(waiting);
                     } else {
                         rest.push_back(Job::Plan(waiting));
@@ -100,6 +143,15 @@ impl Owner {
         rest.extend(after);
         self.queue = rest;
         batch
+    }
+
+    /// How many tasks like this one can be planned for together.
+    fn together(&mut self, first: &Waiting) -> usize {
+        let PlanTask { model, model_digest, .. } = &first.task;
+        match self.models.get(model, model_digest.as_deref()) {
+            Ok(model) if first.estimate.long => model.borrow().method.together(),
+            _ => usize::MAX,
+        }
     }
 
     /// Takes all that has come into the queue and, if the delay allows, waits for what makes the batch full.
@@ -115,109 +167,120 @@ impl Owner {
         }
     }
 
-    /// Answers tasks of one kind, whatever happens: a fault of one ends neither the thread nor the others' plans.
+    /// Answers tasks of one kind, whatever happens: a fault of one ends neither the thread nor the others' plans. Those that take
+    /// long are begun only.
     fn answer(&mut self, batch: Vec<Waiting>) {
         let started = Instant::now();
         let mut accepted = Vec::with_capacity(batch.len());
-        for Waiting { task, enqueued, queued, place, reply } in batch {
-            drop((place, queued));
+        for Waiting { task, enqueued, queued, place, reply, estimate } in batch {
+            drop(queued);
+            let _place = estimate.long.then_some(place);
             // A client that gave up has closed its end.
             let late = task.deadline.filter(|deadline| started - enqueued >= *deadline);
-            match late.map_or_else(|| self.check(&task), |deadline| Err(too_late(deadline))) {
-                _ if reply.is_given_up() => self.load.end(),
-                Ok(()) => accepted.push((task, enqueued, reply)),
-                Err(error) => self.reply(reply, Err(error)),
+            let checked = late.map_or_else(|| self.check(&task), |deadline| Err(too_late(deadline)));
+            let task = Accepted { task, enqueued, reply, estimate, _place };
+            match checked {
+                _ if task.reply.is_given_up() => self.load.end(estimate),
+                Ok(()) => accepted.push(task),
+                Err(error) => self.reply(task, Err(error)),
             }
         }
-        let tasks: Vec<_> = accepted.iter().map(|(task, ..)| task).collect();
-        let Some((first, enqueued, _)) = accepted.first() else { return };
-        let mut clock = AnytimeClock::new(first.deadline, *enqueued);
-        let mut plans = self.guarded(&tasks, &mut clock);
+        let Some(first) = accepted.first() else { return };
+        histogram!("cpn_planner_batch_size").record(accepted.len() as f64);
+        if first.estimate.long {
+            return self.begin(accepted);
+        }
+
+        let tasks: Vec<_> = accepted.iter().map(|accepted| &accepted.task).collect();
+        let mut plans = self.guarded(&tasks, |owner| owner.plan(&tasks));
         if tasks.len() > 1 && plans.iter().any(Result::is_err) {
             // Which of them was at fault shows when each is alone.
-            plans = tasks.iter().flat_map(|task| self.guarded(&[task], &mut clock)).collect();
+            plans = tasks.iter().flat_map(|task| self.guarded(&[task], |owner| owner.plan(&[task]))).collect();
         }
-        // A search that fills its time says nothing of what others take.
-        if !first.is_anytime() {
-            self.load.measure(tasks.len(), started.elapsed());
-        }
-        histogram!("cpn_planner_batch_size").record(tasks.len() as f64);
-        for ((_, enqueued, reply), mut plan) in accepted.into_iter().zip(plans) {
+        for (accepted, mut plan) in accepted.into_iter().zip(plans) {
             if let Ok(response) = &mut plan {
-                response.times.queue_seconds = (started - enqueued).as_secs_f64();
-                observe(response.times);
+                response.times.queue_seconds = (started - accepted.enqueued).as_secs_f64();
             }
-            self.reply(reply, plan);
+            self.reply(accepted, plan);
         }
     }
 
-    fn reply(&self, reply: Reply, answer: Answer) {
-        self.load.end();
+    fn reply(&self, Accepted { reply, estimate, .. }: Accepted, answer: Answer) {
+        self.load.end(estimate);
+        if let Ok(response) = &answer {
+            observe(response.times);
+        }
         reply.send(answer);
     }
 
     fn check(&mut self, task: &PlanTask) -> Result<(), Error> {
-        self.models.get(&task.model, task.model_digest.as_deref())?.check(task)
+        self.models.get(&task.model, task.model_digest.as_deref())?.borrow().check(task)
     }
 
-    /// Plans, one for each task; a panic is everybody's error.
-    fn guarded(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Answer> {
-        catch_unwind(AssertUnwindSafe(|| self.plan(tasks, clock))).unwrap_or_else(|panic| {
-            let reason = panic_message(&*panic);
-            error!(model = tasks[0].model, reason, "planning panicked");
-            vec![Err(Error::new(Code::Internal, "plan", "a plan", reason)); tasks.len()]
-        })
+    /// Runs what answers tasks, one by one; a panic is everybody's error.
+    fn guarded(&mut self, tasks: &[&PlanTask], run: impl FnOnce(&mut Self) -> Vec<Answer>) -> Vec<Answer> {
+        catch_unwind(AssertUnwindSafe(|| run(self)))
+            .unwrap_or_else(|panic| vec![Err(panicked(tasks[0], &*panic)); tasks.len()])
     }
 
     /// Plans for tasks of one kind that were checked.
-    fn plan(&mut self, tasks: &[&PlanTask], clock: &mut AnytimeClock) -> Vec<Answer> {
+    fn plan(&mut self, tasks: &[&PlanTask]) -> Vec<Answer> {
         let Self { models, embeddings, load, .. } = self;
-        let PlanTask { model, model_digest, search, .. } = tasks[0];
-        let model = models.get(model, model_digest.as_deref()).expect("checked");
-        let digest = model.info.digest.clone();
+        let PlanTask { model: name, model_digest, search, .. } = tasks[0];
+        let shared = models.get(name, model_digest.as_deref()).expect("checked");
+        let mut model = shared.borrow_mut();
         let started = Instant::now();
-        let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "encode")).collect();
-        let (xs, x_gs) = encode(model, embeddings, tasks);
-        drop(spans);
-        let encoded = Instant::now();
-        let ends = xs.iter().zip(&x_gs);
-        let queries = tasks.iter().zip(ends);
+        let ends = encode(&mut model, embeddings, tasks);
+        let encoded = started.elapsed();
+        let queries = tasks.iter().zip(&ends);
         let queries = queries.map(|(task, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start });
         let queries: Vec<_> = queries.collect();
         let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "search")).collect();
-        let planned = model.plan(&queries, *search, || load.tasks() <= tasks.len() && clock.has_time());
+        let plans = model.plan(&queries, *search);
         drop(spans);
+        let planned = started.elapsed() - encoded;
+        load.measure(name, |costs| {
+            costs.embedded(tasks.len(), encoded);
+            let (solver, iterations) = resolve(*search, model.method.updates().unwrap_or_default());
+            costs.rolled_out(solver, tasks.len() * rollouts(solver, iterations), planned);
+        });
         let times = StageTimes {
             queue_seconds: 0.0,
-            encode_seconds: (encoded - started).as_secs_f64(),
-            plan_seconds: encoded.elapsed().as_secs_f64(),
+            encode_seconds: encoded.as_secs_f64(),
+            plan_seconds: planned.as_secs_f64(),
         };
-        let answer = |(task, planned): (&&PlanTask, Result<Planned, Error>)| {
-            let Planned { plan, latent_distance } = planned?;
-            let first_action = plan.actions.first().into_iter().flatten().map(|v| v.clamp(-1.0, 1.0)).collect();
-            let next = plan.actions.iter().skip(1).chain(plan.actions.last()).cloned();
-            Ok(PlanResponse {
-                first_action,
-                warm_start: if plan.inner_losses.is_empty() { Vec::new() } else { next.collect() },
-                iterations: plan.iterations as u32,
-                iterations_run: plan.inner_losses.len().saturating_sub(1) as u32,
-                actions: plan.actions,
-                inner_losses: plan.inner_losses,
-                latent_distance,
-                times,
-                model_digest: digest.clone(),
-                goal_id: task.goal_id.clone(),
-            })
-        };
-        tasks.iter().zip(planned).map(answer).collect()
+        let planned = tasks.iter().zip(plans).zip(&queries);
+        planned.map(|((task, plan), query)| model.response(task, plan, query, times)).collect()
+    }
+
+    /// Begins a search for tasks of one kind that were checked.
+    fn begin(&mut self, accepted: Vec<Accepted>) {
+        let started = Instant::now();
+        let Self { models, embeddings, .. } = self;
+        let tasks: Vec<_> = accepted.iter().map(|accepted| &accepted.task).collect();
+        let PlanTask { model: name, model_digest, .. } = tasks[0];
+        let model = models.get(name, model_digest.as_deref()).expect("checked");
+        let ends = catch_unwind(AssertUnwindSafe(|| encode(&mut model.borrow_mut(), embeddings, &tasks)));
+        let encoded = started.elapsed();
+        match ends {
+            Ok(ends) => {
+                self.load.measure(name, |costs| costs.embedded(tasks.len(), encoded));
+                self.searches.begin(&model, accepted, ends, encoded);
+            }
+            Err(panic) => {
+                let error = panicked(tasks[0], &*panic);
+                accepted.into_iter().for_each(|accepted| self.reply(accepted, Err(error.clone())));
+            }
+        }
     }
 }
 
 /// Embeddings by what was embedded and the checkpoint that did.
 type Embeddings = LruCache<(String, String), Vec<f32>>;
 
-/// Embeds every observation, and the goals that are not known yet.
-fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -> (Vec<Vec<f32>>, Vec<Vec<f32>>) {
+/// Embeds every observation, and the goals that are not known yet: x and x_g of each task.
+fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -> Vec<(Vec<f32>, Vec<f32>)> {
+    let _spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "encode")).collect();
     let key = |task: &PlanTask| (task.goal_id.clone(), model.info.digest.clone());
     let known: Vec<_> = tasks.iter().map(|task| embeddings.get(&key(task)).cloned()).collect();
     let unknown = tasks.iter().zip(&known).filter(|(_, known)| known.is_none()).map(|(task, _)| &*task.goal);
@@ -227,27 +290,7 @@ fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -
     let mut new = xs.split_off(tasks.len()).into_iter();
     let x_gs: Vec<_> = known.into_iter().map(|known| known.or_else(|| new.next()).unwrap_or_default()).collect();
     keys.into_iter().zip(&x_gs).for_each(|(key, x_g)| drop(embeddings.put(key, x_g.clone())));
-    (xs, x_gs)
-}
-/// Tells a search whether there is time for another iteration.
-struct AnytimeClock {
-    end: Instant,
-    last: Instant,
-    iterations: usize,
-}
-
-impl AnytimeClock {
-    fn new(deadline: Option<Duration>, enqueued: Instant) -> Self {
-        Self { end: enqueued + deadline.unwrap_or_default().mul_f64(USABLE), last: Instant::now(), iterations: 0 }
-    }
-
-    /// If the next takes as long as the last.
-    fn has_time(&mut self) -> bool {
-        let now = Instant::now();
-        let took = now - std::mem::replace(&mut self.last, now);
-        self.iterations += 1;
-        now + took < self.end && self.iterations <= MOST_ITERATIONS
-    }
+    xs.into_iter().zip(x_gs).collect()
 }
 
 /// Counts an answer, and where its time went.
@@ -258,6 +301,13 @@ fn observe(times: StageTimes) {
     {
         histogram!("cpn_planner_stage_seconds", "stage" => stage).record(seconds);
     }
+}
+
+/// The error of a task whose planning panicked.
+pub(crate) fn panicked(task: &PlanTask, panic: &(dyn Any + Send)) -> Error {
+    let reason = panic_message(panic);
+    error!(model = task.model, reason, "planning panicked");
+    Error::new(Code::Internal, "plan", "a plan", reason)
 }
 
 /// What a panic says; `tch` panics with the message of libtorch.

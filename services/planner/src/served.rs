@@ -2,67 +2,103 @@
 
 use crate::model::Model;
 use lru::LruCache;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
+use std::rc::Rc;
+use wire::planner::ModelInfo;
 use wire::{Code, Error};
 
 /// The models that are served, by name.
 pub(crate) struct Served {
     by_name: BTreeMap<String, Checkpoints>,
+    capacity: usize,
     retired_capacity: NonZeroUsize,
 }
 
+/// A model that searches may go on with after it is gone from here.
+pub(crate) type Shared = Rc<RefCell<Model>>;
+
 /// A model's checkpoints.
 struct Checkpoints {
+    /// Of the one that is current.
+    digest: String,
     /// The one that answers who asks for none.
-    current: Model,
+    current: Shared,
     /// Those that were swapped out, by digest: an episode that began with one may go on with it.
-    retired: LruCache<String, Model>,
+    retired: LruCache<String, Shared>,
 }
 
 impl Served {
-    pub(crate) fn new(models: Vec<Model>, retired_capacity: NonZeroUsize) -> Self {
-        let mut served = Self { by_name: BTreeMap::new(), retired_capacity };
-        for model in models {
-            served.swap_in(model);
-        }
-        served
+    /// Room for `capacity` names, and for so many checkpoints of each that were swapped out.
+    pub(crate) fn new(capacity: usize, retired_capacity: NonZeroUsize) -> Self {
+        Self { by_name: BTreeMap::new(), capacity, retired_capacity }
     }
 
     /// Serves a model in place of the one of its name, which is kept for those who ask for it.
-    pub(crate) fn swap_in(&mut self, model: Model) {
-        let retired = match self.by_name.remove(&model.info.name) {
-            Some(Checkpoints { current, mut retired }) => {
-                retired.pop(&model.info.digest);
-                if current.info.digest != model.info.digest {
-                    retired.put(current.info.digest.clone(), current);
+    ///
+    /// # Errors
+    /// `RESOURCE_EXHAUSTED` if the name is new and one too many.
+    pub(crate) fn swap_in(&mut self, model: Model) -> Result<(), Error> {
+        let ModelInfo { name, digest, .. } = model.info.clone();
+        check_capacity(&name, self.by_name.keys(), self.capacity)?;
+        let retired = match self.by_name.remove(&name) {
+            Some(Checkpoints { digest: before, current, mut retired }) => {
+                retired.pop(&digest);
+                if before != digest {
+                    retired.put(before, current);
                 }
                 retired
             }
             None => LruCache::new(self.retired_capacity),
         };
-        self.by_name.insert(model.info.name.clone(), Checkpoints { current: model, retired });
+        self.by_name.insert(name, Checkpoints { digest, current: Rc::new(RefCell::new(model)), retired });
+        Ok(())
+    }
+
+    /// Forgets a model, with all its checkpoints.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown name.
+    pub(crate) fn remove(&mut self, name: &str) -> Result<(), Error> {
+        let removed = self.by_name.remove(name);
+        removed.map(drop).ok_or_else(|| unknown_model(name, self.by_name.keys()))
     }
 
     /// The model of a name, with the checkpoint that must answer, if one must.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown name; `FAILED_PRECONDITION` for a checkpoint that is not kept.
-    pub(crate) fn get(&mut self, name: &str, digest: Option<&str>) -> Result<&mut Model, Error> {
+    pub(crate) fn get(&mut self, name: &str, digest: Option<&str>) -> Result<Shared, Error> {
         if !self.by_name.contains_key(name) {
             return Err(unknown_model(name, self.by_name.keys()));
         }
-        let Checkpoints { current, retired } = self.by_name.get_mut(name).expect("it is there");
+        let Checkpoints { digest: served, current, retired } = self.by_name.get_mut(name).expect("it is there");
         match digest {
-            Some(digest) if digest != current.info.digest => {
-                let kept = format!("{}, which is served, or one of {} kept before", current.info.digest, retired.len());
-                retired
-                    .get_mut(digest)
-                    .ok_or_else(|| Error::new(Code::FailedPrecondition, "model_digest", kept, digest))
+            Some(digest) if digest != served => {
+                let kept = format!("{served}, which is served, or one of {} kept before", retired.len());
+                let kept = |got| Error::new(Code::FailedPrecondition, "model_digest", kept, got);
+                retired.get(digest).map(Rc::clone).ok_or_else(|| kept(digest))
             }
-            _ => Ok(current),
+            _ => Ok(Rc::clone(current)),
         }
     }
+}
+
+/// Whether there is room for a model of this name.
+///
+/// # Errors
+/// `RESOURCE_EXHAUSTED` if the name is new and one too many.
+pub(crate) fn check_capacity<'a>(
+    name: &str,
+    mut served: impl ExactSizeIterator<Item = &'a String>,
+    capacity: usize,
+) -> Result<(), Error> {
+    if served.len() < capacity || served.any(|served| served == name) {
+        return Ok(());
+    }
+    let expected = format!("one of the {capacity} that are served, or one of them unloaded");
+    Err(Error::new(Code::ResourceExhausted, "model", expected, name))
 }
 
 /// The named model is not among those served.

@@ -1,11 +1,12 @@
 //! A request to plan on its way to the model.
 
+use crate::load::Estimate;
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 use tracing::Span;
-use wire::planner::{PlanResponse, Search};
+use wire::planner::{PlanResponse, Search, Solver};
 use wire::{Code, Error, Observation};
 
 /// A request to plan whose names are resolved and whose images are of the right size.
@@ -35,9 +36,20 @@ pub(crate) struct Waiting {
     pub(crate) enqueued: Instant,
     /// Of its time in the queue.
     pub(crate) queued: Span,
-    /// Given back when the plan starts.
+    /// Given back when the plan starts or, if it is done in pieces, when it is answered.
     pub(crate) place: OwnedSemaphorePermit,
     pub(crate) reply: Reply,
+    pub(crate) estimate: Estimate,
+}
+
+/// A task that is being planned for.
+#[derive(Debug)]
+pub(crate) struct Accepted {
+    pub(crate) task: PlanTask,
+    pub(crate) enqueued: Instant,
+    pub(crate) reply: Reply,
+    pub(crate) estimate: Estimate,
+    pub(crate) _place: Option<OwnedSemaphorePermit>,
 }
 
 /// What a task comes to.
@@ -61,6 +73,11 @@ impl PlanTask {
     /// Whether the plan goes on until its own deadline, so that nobody can share it.
     pub(crate) fn is_anytime(&self) -> bool {
         self.search.is_some_and(|search| search.anytime)
+    }
+
+    /// Whether plans are tried, so that planning together saves nothing.
+    pub(crate) fn is_sampled(&self) -> bool {
+        self.search.is_some_and(|search| search.solver != Solver::Gradient)
     }
 
     /// The request's field that the observation came from.
@@ -130,4 +147,14 @@ pub(crate) fn too_many(deadline: Duration, wait: Duration) -> Error {
 
 pub(crate) fn too_late(deadline: Duration) -> Error {
     Error::new(Code::DeadlineExceeded, "deadline_ms", format!("an answer within {} ms", deadline.as_millis()), "none")
+}
+
+/// A search that takes so long in any case is not begun.
+pub(crate) fn too_long(deadline: Duration, least: Duration) -> Error {
+    let expected = format!("one that takes less than the deadline of {} ms", deadline.as_millis());
+    Error::new(Code::ResourceExhausted, "search", expected, format!("{} ms or more", least.as_millis()))
+}
+
+pub(crate) fn stopped() -> Error {
+    Error::new(Code::Unavailable, "planner", "a running planner", "one that is shutting down")
 }

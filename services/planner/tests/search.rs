@@ -4,8 +4,13 @@
 
 mod common;
 
-use common::{Fixture, checkpoint, is, plan_request, timeless};
-use cpn::MethodKind;
+use common::{Client, Fixture, PATIENCE, checkpoint, from_bytes, is, plan_request, serve, soon, timeless};
+use cpn::method::{Observed, Ongoing, Query};
+use cpn::{Input, Method, MethodKind, Plan};
+use planner::model::RANDOM;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 use wire::Code;
 use wire::planner::PlanResponse;
 use wire::proto::{self, Solver};
@@ -87,4 +92,166 @@ async fn what_cannot_be_searched_is_refused() {
         );
         client.plan(plan_request("cpn", 1)).await.unwrap();
     }
+}
+
+/// A search that takes seconds at least.
+fn long(solver: Solver) -> proto::PlanRequest {
+    let samples = if solver == Solver::Gradient { 0 } else { 4096 };
+    let search = proto::Search { solver: solver.into(), iterations: Some(1000), samples, anytime: false };
+    proto::PlanRequest { search: Some(search), ..plan_request("cpn", 3) }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_search_that_cannot_meet_its_deadline_is_refused_at_once() {
+    let fixture = fixture().await;
+    for client in fixture.clients() {
+        for solver in [Solver::Cem, Solver::Mppi, Solver::Hybrid] {
+            let hopeless = proto::PlanRequest { deadline_ms: 100, ..long(solver) };
+            is(Code::ResourceExhausted, "search", client.plan(hopeless).await);
+        }
+    }
+}
+
+/// While a search goes on that takes long, others are planned for and models are swapped; the search comes to the same plan as
+/// without them.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_long_search_holds_nobody_up() {
+    let fixture = fixture().await;
+    let [_, grpc, _] = fixture.clients();
+    let mut moderate = long(Solver::Cem);
+    moderate.search.as_mut().unwrap().iterations = Some(40);
+    let alone = timeless(grpc.plan(moderate.clone()).await.unwrap());
+
+    let client = grpc.clone();
+    let endless = tokio::spawn(async move { client.plan(long(Solver::Hybrid)).await });
+    let client = grpc.clone();
+    let searching = tokio::spawn(async move { client.plan(moderate).await });
+    for client in fixture.clients() {
+        for seed in 0..10 {
+            client.plan(plan_request("cpn", seed)).await.unwrap();
+            client.plan(plan_request(RANDOM, seed)).await.unwrap();
+        }
+        client.load_model(from_bytes("te-bc", checkpoint(MethodKind::TeBc, 2))).await.unwrap();
+        // What goes on keeps its checkpoint, though more are swapped in than are kept.
+        for seed in 2..7 {
+            client.load_model(from_bytes("cpn", checkpoint(MethodKind::Cpn, seed))).await.unwrap();
+        }
+        client.load_model(from_bytes("cpn", checkpoint(MethodKind::Cpn, 1))).await.unwrap();
+    }
+    assert_eq!(timeless(soon(searching).await.unwrap().unwrap()), alone);
+    assert!(!endless.is_finished(), "it takes longer than all of these");
+    endless.abort();
+}
+
+/// A method whose searches never end, and which counts their pieces.
+struct Endless(Arc<AtomicU64>);
+
+impl Method for Endless {
+    fn name(&self) -> &'static str {
+        "cpn"
+    }
+
+    fn horizon(&self) -> usize {
+        1
+    }
+
+    fn actions(&self) -> usize {
+        4
+    }
+
+    fn updates(&self) -> Option<usize> {
+        Some(1)
+    }
+
+    fn takes(&self, _: Input) -> bool {
+        true
+    }
+
+    fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
+        vec![vec![0.0]; inputs.len()]
+    }
+
+    fn plan(&mut self, queries: &[Query<'_>], _: &mut cpn::method::Search<'_>) -> Vec<Plan> {
+        common::random(queries)
+    }
+
+    fn resume(&mut self, _: &[Query<'_>], _: &mut Ongoing, go_on: &mut dyn FnMut() -> bool) {
+        loop {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            if !go_on() {
+                return;
+            }
+        }
+    }
+}
+
+/// Waits until no piece is done any more.
+async fn has_ended(pieces: &AtomicU64) {
+    let mut before = pieces.load(Ordering::Relaxed);
+    let ended = async {
+        loop {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            let now = pieces.load(Ordering::Relaxed);
+            if std::mem::replace(&mut before, now) == now {
+                return;
+            }
+        }
+    };
+    soon(ended).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_search_ends_with_its_deadline_and_with_its_client() {
+    let fixture = fixture().await;
+    let pieces = Arc::new(AtomicU64::new(0));
+    serve(&fixture.planner.core(), "endless", Box::new(Endless(Arc::clone(&pieces)))).await;
+    let endless = || proto::PlanRequest { search: search(Solver::Gradient, 1000, false), ..plan_request("endless", 1) };
+    for client in fixture.clients() {
+        let request = proto::PlanRequest { deadline_ms: 200, ..endless() };
+        is(Code::DeadlineExceeded, "deadline_ms", client.plan(request).await);
+        has_ended(&pieces).await;
+        client.plan(plan_request("cpn", 1)).await.unwrap();
+    }
+
+    let [core, grpc, _] = fixture.clients();
+    for client in [core, grpc] {
+        let (before, asked) = (pieces.load(Ordering::Relaxed), client.clone());
+        let asking = tokio::spawn(async move { asked.plan(endless()).await });
+        let begun = async {
+            while pieces.load(Ordering::Relaxed) == before {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        soon(begun).await;
+        asking.abort();
+        has_ended(&pieces).await;
+    }
+}
+
+/// So many searches go on at the same time as half of the queue holds, and a planner that stops waits for none of them for ever.
+#[tokio::test(flavor = "multi_thread")]
+async fn searches_are_bounded_and_do_not_outlast_the_planner() {
+    let fixture = Fixture::start(&[], |config| config.queue_capacity = 3.try_into().unwrap()).await;
+    let pieces = Arc::new(AtomicU64::new(0));
+    serve(&fixture.planner.core(), "endless", Box::new(Endless(Arc::clone(&pieces)))).await;
+    let endless = proto::PlanRequest { search: search(Solver::Gradient, 1000, false), ..plan_request("endless", 1) };
+    let [_, grpc, _] = fixture.clients();
+    let ask = |client: Client| {
+        let endless = endless.clone();
+        tokio::spawn(async move { client.plan(endless).await })
+    };
+    let mut going_on = vec![ask(grpc.clone()), ask(grpc.clone())];
+    let refused = async {
+        loop {
+            let one_more = ask(grpc.clone());
+            match tokio::time::timeout(Duration::from_millis(100), one_more).await {
+                Ok(answer) => return answer.unwrap(),
+                Err(_) => going_on.push(ask(grpc.clone())),
+            }
+        }
+    };
+    is(Code::ResourceExhausted, "queue", soon(refused).await);
+    grpc.plan(plan_request(RANDOM, 1)).await.unwrap();
+    tokio::time::timeout(PATIENCE, fixture.planner.shutdown()).await.unwrap().unwrap();
+    has_ended(&pieces).await;
 }

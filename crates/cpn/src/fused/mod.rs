@@ -20,6 +20,7 @@
 mod attenuated;
 mod convolution;
 mod dense;
+mod descent;
 mod embedder;
 mod encoder;
 mod factor;
@@ -44,11 +45,13 @@ mod sparse;
 mod tiles;
 mod winograd;
 
+pub(crate) use descent::Descent;
 pub use embedder::Embedder;
 pub use linear::{Weights, add};
 pub use outer::Samples;
 pub use planner::Planner;
 pub use real::Real;
+pub(crate) use sampling::Sampling;
 
 use crate::config::ModelConfig;
 use network::Network;

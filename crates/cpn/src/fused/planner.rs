@@ -1,16 +1,17 @@
 //! Plans without a graph, in memory that is kept from plan to plan.
 
 use super::Variables;
+use super::descent::Descent;
 use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
 use super::linear::Weights;
 use super::network::{Buffers, Network};
 use super::real::Real;
-use super::sampling;
+use super::sampling::Sampling;
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
-use crate::method::{Iterations, Method, Observed, Plan, Query, Search, Solver};
+use crate::method::{Iterations, Method, Observed, Ongoing, Plan, Query, Search, Solver, State};
 use rayon::prelude::*;
 
 /// R, the plans of a block: with more of them weights are read less often, with fewer what the passes leave lies nearer.
@@ -150,50 +151,30 @@ impl Worker<f32> {
         queries: &[Query<'_>],
         iterations: &mut Iterations<'_>,
     ) -> Vec<Plan> {
-        let rows = queries.len();
-        let ends = || queries.iter().map(|query| (query.x, query.x_g));
-        let source = if queries[0].start.is_empty() { Actions::Proposed } else { Actions::Given };
-        for (r, query) in queries.iter().enumerate() {
-            self.set_plan(dynamics, rows, r, query.start);
+        let mut descent = Descent::begin(self, dynamics, queries);
+        while dynamics.plans && iterations.go_on(descent.done) {
+            let last = iterations.ends_at(descent.done + 1);
+            descent.update(self, dynamics, queries, (last, iterations.keep_best()));
         }
-        let purpose = if dynamics.plans { Purpose::Gradient } else { Purpose::Actions };
-        let losses: Vec<f32> = self.roll_out(dynamics, (source, purpose), ends()).collect();
-        let begun = |(r, loss)| {
-            let inner_losses = if dynamics.plans { vec![loss] } else { Vec::new() };
-            Plan { actions: self.plan(dynamics, rows, r), inner_losses, iterations: 0 }
-        };
-        let mut plans: Vec<Plan> = losses.into_iter().enumerate().map(begun).collect();
-        let mut done = 0;
-        while dynamics.plans && iterations.go_on(done) {
-            done += 1;
-            self.descend(dynamics, rows);
-            let purpose = if iterations.ends_at(done) { Purpose::Loss } else { Purpose::Gradient };
-            let losses: Vec<f32> = self.roll_out(dynamics, (Actions::Moved, purpose), ends()).collect();
-            for (r, (plan, loss)) in plans.iter_mut().zip(losses).enumerate() {
-                let best = plan.inner_losses[plan.inner_losses.len() - 1];
-                let better = loss < best || !iterations.keep_best();
-                if better {
-                    plan.actions = self.plan(dynamics, rows, r);
-                    plan.iterations = done;
-                }
-                plan.inner_losses.push(if better { loss } else { best });
-            }
-        }
-        plans
+        descent.plans
     }
+}
 
-    fn search(
-        &mut self,
-        dynamics: &Dynamics<f32>,
-        queries: &[Query<'_>],
-        solver: Solver,
-        iterations: &mut Iterations<'_>,
-    ) -> Vec<Plan> {
-        match solver {
-            Solver::Gradient => self.by_gradient(dynamics, queries, iterations),
-            _ => queries.iter().map(|query| sampling::plan(self, dynamics, *query, solver, iterations)).collect(),
+/// Plans by trying plans, one query after the other: all workers try those of one.
+fn by_sampling(
+    workers: &mut [Worker<f32>],
+    dynamics: &Dynamics<f32>,
+    query: Query<'_>,
+    (solver, iterations): (Solver, &mut Iterations<'_>),
+) -> Plan {
+    let mut sampling = Sampling::begin(&mut workers[0], dynamics, query);
+    while iterations.go_on(sampling.done) {
+        let done = sampling.done;
+        while sampling.done == done {
+            sampling.go_on(workers, dynamics, query, solver);
         }
     }
+    sampling.into_plan()
 }
 
 impl Method for Planner {
@@ -226,19 +207,87 @@ impl Method for Planner {
     }
 
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
-        let dynamics = &self.dynamics;
-        match search.iterations {
-            Iterations::Fixed(count) => {
-                let solver = search.solver;
-                let block = if solver == Solver::Gradient { BLOCK } else { 1 };
-                spread(&mut self.workers, queries, (block, block), |worker, queries| {
-                    worker.search(dynamics, queries, solver, &mut Iterations::Fixed(count))
+        let (dynamics, workers, iterations) = (&self.dynamics, &mut self.workers, &mut search.iterations);
+        match (search.solver, iterations) {
+            (Solver::Gradient, Iterations::Fixed(count)) => {
+                spread(workers, queries, (BLOCK, BLOCK), |worker, queries| {
+                    worker.by_gradient(dynamics, queries, &mut Iterations::Fixed(*count))
                 })
             }
-            Iterations::While(_) => {
-                let block = |queries| self.workers[0].search(dynamics, queries, search.solver, &mut search.iterations);
+            (Solver::Gradient, iterations) => {
+                let block = |queries| workers[0].by_gradient(dynamics, queries, iterations);
                 queries.chunks(BLOCK).flat_map(block).collect()
             }
+            (solver, iterations) => {
+                queries.iter().map(|query| by_sampling(workers, dynamics, *query, (solver, iterations))).collect()
+            }
+        }
+    }
+
+    fn together(&self) -> usize {
+        BLOCK * self.workers.len()
+    }
+
+    fn resume(&mut self, queries: &[Query<'_>], ongoing: &mut Ongoing, go_on: &mut dyn FnMut() -> bool) {
+        let (dynamics, workers) = (&self.dynamics, &mut self.workers[..]);
+        let (solver, count, keep_best) = (ongoing.solver, ongoing.iterations, ongoing.keep_best);
+        match &mut ongoing.state {
+            State::New if !dynamics.plans || (solver == Solver::Gradient && queries.len() > BLOCK * workers.len()) => {
+                let iterations = Iterations::Fixed(count);
+                ongoing.state = State::Whole(self.plan(queries, &mut Search { solver, iterations }));
+            }
+            State::New if solver == Solver::Gradient => {
+                let share = queries.len().div_ceil(workers.len());
+                let begin = |(worker, queries): (&mut Worker<f32>, &[Query<'_>])| {
+                    let mut descent = Descent::begin(worker, dynamics, queries);
+                    descent.leave(worker, dynamics);
+                    descent
+                };
+                let begun = workers.iter_mut().zip(queries.chunks(share)).map(begin).collect();
+                ongoing.state = State::Descents(begun);
+            }
+            State::New => ongoing.state = State::Sampling(Sampling::begin(&mut workers[0], dynamics, queries[0])),
+            State::Descents(descents) => {
+                let mut rest = queries;
+                let mut parts: Vec<_> = workers
+                    .iter_mut()
+                    .zip(descents)
+                    .map(|(worker, descent)| {
+                        let (part, others) = rest.split_at(descent.plans.len());
+                        rest = others;
+                        (worker, descent, part)
+                    })
+                    .collect();
+                loop {
+                    let update = |(worker, descent, queries): &mut (&mut Worker<f32>, &mut Descent, &[Query<'_>])| {
+                        let last = descent.done + 1 == count && !keep_best;
+                        descent.update(worker, dynamics, queries, (last, keep_best));
+                    };
+                    let over = |parts: &[(&mut Worker<f32>, &mut Descent, &[Query<'_>])]| {
+                        parts.iter().all(|(_, descent, _)| descent.done >= count)
+                    };
+                    if over(&parts) {
+                        break;
+                    }
+                    match &mut parts[..] {
+                        [one] => update(one),
+                        several => several.par_iter_mut().for_each(update),
+                    }
+                    if over(&parts) || !go_on() {
+                        break;
+                    }
+                }
+                parts.into_iter().for_each(|(worker, descent, _)| descent.leave(worker, dynamics));
+            }
+            State::Sampling(sampling) => {
+                while sampling.done < count {
+                    sampling.go_on(workers, dynamics, queries[0], solver);
+                    if !go_on() {
+                        break;
+                    }
+                }
+            }
+            State::Whole(_) => {}
         }
     }
 }

@@ -2,10 +2,11 @@
 
 use super::inner::{Actions, Purpose};
 use super::planner::{BLOCK, Dynamics, Worker};
-use crate::method::{Iterations, Plan, Query, Solver};
+use crate::method::{Plan, Query, Solver};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
 
 /// Spread of the first generation, of actions that reach from -1 to 1; MPPI's keeps it.
 const SPREAD: f32 = 0.5;
@@ -24,57 +25,102 @@ struct Candidate {
 }
 
 /// Where the next generation is drawn.
+#[derive(Debug)]
 struct Belief {
     /// `[H][A]`.
     mean: Vec<Vec<f32>>,
     spread: Vec<Vec<f32>>,
 }
 
-/// The best plan that generation after generation finds, from the policy's actions or the query's own; the same for the same
-/// seed.
-pub fn plan(
-    worker: &mut Worker<f32>,
-    dynamics: &Dynamics<f32>,
-    query: Query<'_>,
-    solver: Solver,
-    iterations: &mut Iterations<'_>,
-) -> Plan {
-    let mut rng = ChaCha8Rng::seed_from_u64(query.seed);
-    let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
-    worker.set_plan(dynamics, 1, 0, query.start);
-    let loss = roll_out(worker, dynamics, query, (source, Purpose::Loss));
-    let mut best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
-    let spread = best.actions.iter().map(|action| vec![SPREAD; action.len()]).collect();
-    let mut belief = Belief { mean: best.actions.clone(), spread };
-    let (mut inner_losses, mut found, mut done) = (vec![loss], 0, 0);
-    while iterations.go_on(done) {
-        done += 1;
-        let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { break };
-        let mut generation = draw(&belief, count, &mut rng);
-        evaluate(worker, dynamics, query, &mut generation);
+/// A search generation after generation, from the policy's actions or the query's own; the same for the same seed. It can be left
+/// after any piece of a generation and taken up again.
+#[derive(Debug)]
+pub(crate) struct Sampling {
+    rng: ChaCha8Rng,
+    best: Candidate,
+    belief: Belief,
+    /// Of the best plan before each generation and after the last.
+    inner_losses: Vec<f32>,
+    /// Generations after which the best plan was found.
+    found: usize,
+    /// Generations that are whole.
+    pub(crate) done: usize,
+    /// What has been tried of the next one.
+    generation: Vec<Candidate>,
+    /// Rollouts so far.
+    pub(crate) rollouts: usize,
+}
+
+impl Sampling {
+    /// Rolls out the plan that the first generation is drawn around.
+    pub(super) fn begin(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>) -> Self {
+        let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
+        worker.set_plan(dynamics, 1, 0, query.start);
+        let loss = roll_out(worker, dynamics, query, (source, Purpose::Loss));
+        let best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+        let spread = best.actions.iter().map(|action| vec![SPREAD; action.len()]).collect();
+        Self {
+            rng: ChaCha8Rng::seed_from_u64(query.seed),
+            belief: Belief { mean: best.actions.clone(), spread },
+            best,
+            inner_losses: vec![loss],
+            found: 0,
+            done: 0,
+            generation: Vec::new(),
+            rollouts: 1,
+        }
+    }
+
+    /// Tries a block of plans for each worker and, with the last of a generation, learns from it.
+    pub(super) fn go_on(
+        &mut self,
+        workers: &mut [Worker<f32>],
+        dynamics: &Dynamics<f32>,
+        query: Query<'_>,
+        solver: Solver,
+    ) {
+        let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { return };
+        let tried = self.generation.len();
+        let piece = (count - tried).min(BLOCK * workers.len());
+        self.generation.extend(draw(&self.belief, piece, &mut self.rng));
+        evaluate(workers, dynamics, query, &mut self.generation[tried..]);
+        self.rollouts += piece;
+        if self.generation.len() == count {
+            self.learn(&mut workers[0], dynamics, query, solver);
+        }
+    }
+
+    /// Ends a generation.
+    fn learn(&mut self, worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, solver: Solver) {
+        self.done += 1;
+        let mut generation = std::mem::take(&mut self.generation);
         generation.sort_by(|a, b| a.loss.total_cmp(&b.loss));
         let mut nearest = generation[0].clone();
         match solver {
-            Solver::Mppi(_) => belief.mean = weighted_mean(&generation),
-            _ => belief = around(&generation[..(count / ELITE).max(2).min(count)]),
+            Solver::Mppi(_) => self.belief.mean = weighted_mean(&generation),
+            _ => self.belief = around(&generation[..(generation.len() / ELITE).max(2).min(generation.len())]),
         }
         if let Solver::Hybrid(_) = solver {
-            worker.set_plan(dynamics, 1, 0, &belief.mean);
+            worker.set_plan(dynamics, 1, 0, &self.belief.mean);
             roll_out(worker, dynamics, query, (Actions::Given, Purpose::Gradient));
             worker.descend(dynamics, 1);
             let loss = roll_out(worker, dynamics, query, (Actions::Moved, Purpose::Loss));
             let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
             if descended.loss < nearest.loss {
-                belief.mean.clone_from(&descended.actions);
+                self.belief.mean.clone_from(&descended.actions);
                 nearest = descended;
             }
         }
-        if nearest.loss < best.loss {
-            (best, found) = (nearest, done);
+        if nearest.loss < self.best.loss {
+            (self.best, self.found) = (nearest, self.done);
         }
-        inner_losses.push(best.loss);
+        self.inner_losses.push(self.best.loss);
     }
-    Plan { actions: best.actions, inner_losses, iterations: found }
+
+    /// The best plan of the generations that are whole.
+    pub(crate) fn into_plan(self) -> Plan {
+        Plan { actions: self.best.actions, inner_losses: self.inner_losses, iterations: self.found }
+    }
 }
 
 /// The inner loss of the worker's one plan.
@@ -82,18 +128,25 @@ fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>
     worker.roll_out(dynamics, how, [(query.x, query.x_g)].into_iter()).sum()
 }
 
-/// Fills in the losses.
-fn evaluate(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, generation: &mut [Candidate]) {
-    for block in generation.chunks_mut(BLOCK) {
-        let rows = block.len();
-        for (r, candidate) in block.iter().enumerate() {
-            worker.set_plan(dynamics, rows, r, &candidate.actions);
-        }
-        let ends = std::iter::repeat_n((query.x, query.x_g), rows);
-        for (candidate, loss) in block.iter_mut().zip(worker.roll_out(dynamics, (Actions::Given, Purpose::Loss), ends))
-        {
-            candidate.loss = loss;
-        }
+/// Fills in the losses, of a block for each worker at most.
+fn evaluate(workers: &mut [Worker<f32>], dynamics: &Dynamics<f32>, query: Query<'_>, candidates: &mut [Candidate]) {
+    if candidates.len() <= BLOCK {
+        // Another thread would only have to be woken.
+        return evaluate_block(&mut workers[0], dynamics, query, candidates);
+    }
+    let blocks = workers.par_iter_mut().zip(candidates.par_chunks_mut(BLOCK));
+    blocks.for_each(|(worker, block)| evaluate_block(worker, dynamics, query, block));
+}
+
+fn evaluate_block(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, block: &mut [Candidate]) {
+    let rows = block.len();
+    for (r, candidate) in block.iter().enumerate() {
+        worker.set_plan(dynamics, rows, r, &candidate.actions);
+    }
+    let ends = std::iter::repeat_n((query.x, query.x_g), rows);
+    let losses = worker.roll_out(dynamics, (Actions::Given, Purpose::Loss), ends);
+    for (candidate, loss) in block.iter_mut().zip(losses) {
+        candidate.loss = loss;
     }
 }
 

@@ -371,7 +371,7 @@ pub async fn serve(core: &PlannerCore, name: &str, method: Box<dyn Method>) {
         horizon: 1,
         version: 0,
     };
-    core.serve(Model { info, render_spec: String::new(), method }).await.unwrap();
+    core.serve(Model::new(info, String::new(), method)).await.unwrap();
 }
 
 pub fn is(code: Code, field: &str, result: Result<PlanResponse, Error>) {
