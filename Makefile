@@ -8,11 +8,12 @@ EXPORT := export/.venv
 BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
+STACK := tests/stack/.venv
 COMPOSE ?= docker-compose
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-bench fuzz bench-sim bench-train bench-plan lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench fuzz bench-sim bench-train bench-plan bench-stack lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -47,6 +48,10 @@ $(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock | $(UV)
 
 $(KUBERNETES)/.ready: tests/kubernetes/pyproject.toml tests/kubernetes/uv.lock | $(UV)
 	cd tests/kubernetes && $(UV) sync --quiet --locked
+	touch $@
+
+$(STACK)/.ready: tests/stack/pyproject.toml tests/stack/uv.lock | $(UV)
+	cd tests/stack && $(UV) sync --quiet --locked
 	touch $@
 
 build: setup ## Compile the services
@@ -106,6 +111,10 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
+	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
+	cd tests/stack && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest $(if $(ONLY),-k "$(ONLY)")
+
 test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, without one
 	cd tests/kubernetes && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
@@ -127,17 +136,21 @@ bench-plan: build $(BENCH)/.ready ## Compare plans with PyTorch, JAX and ONNX Ru
 		--ours "$(or $(OURS),cargo bench --quiet --workspace --locked --bench plan --)" \
 		--serve "$(or $(SERVE),cargo bench --quiet --workspace --locked --bench serve --)"
 
+bench-stack: $(STACK)/.ready ## Measure the containers: throughput, start-up, recovery, the cost of mutual TLS (QUICK=1 for a glance)
+	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
+	cd tests/stack && $(UV) run --quiet python -m cpn_stack.bench --out $(CURDIR)/runs/bench $(if $(QUICK),--quick)
+
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cd fuzz && cargo fmt --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
 	cd fuzz && cargo fmt
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes
+	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) .libtorch
+	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) .libtorch

@@ -1,0 +1,1 @@
+"""The stack of docker-compose.yml, driven by `docker` and Compose."""
