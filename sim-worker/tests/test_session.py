@@ -9,10 +9,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import tyro
 import zenoh
 
 from cpn.v1 import demonstration_pb2
 from cpn_sim_worker import keys
+from cpn_sim_worker.options import ServeConfig
 from cpn_sim_worker.session import (
     MAX_MESSAGE_BYTES,
     ConfigError,
@@ -109,6 +111,17 @@ def test_empty_variables_count_as_unset(monkeypatch: pytest.MonkeyPatch) -> None
         "peer": ["tcp/127.0.0.1:0"],
         "client": [],
     }
+
+
+@pytest.mark.parametrize("text", ["None", "7", "true", "2024"])
+def test_text_is_text_in_options_and_environment(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    options = ["--worker", text, "--namespace", text, "--user", text, "--password-file", text, "--zenoh-config", text]
+    given = tyro.cli(ServeConfig, args=options, config=(tyro.conf.OmitArgPrefixes,))
+    assert given.worker == text
+    for variable in ("CPN_NAMESPACE", "CPN_USER", "CPN_PASSWORD_FILE", "ZENOH_CONFIG"):
+        monkeypatch.setenv(variable, text)
+    assert given.zenoh == ZenohConfig()
+    assert (given.zenoh.namespace, given.zenoh.user, given.zenoh.password_file) == (text, text, Path(text))
 
 
 def test_variable_at_fault_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

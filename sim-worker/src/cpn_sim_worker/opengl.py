@@ -7,6 +7,7 @@ does not say what to install.
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
 
+import logging
 import os
 import warnings
 from typing import Any
@@ -40,6 +41,8 @@ def load_mujoco() -> None:
     platform = os.environ.get("PYOPENGL_PLATFORM")
     if platform and _backend() != "glfw" and platform.lower() != _backend():
         raise ConfigError(f"PYOPENGL_PLATFORM: expected {_backend()}, as MUJOCO_GL, or none, got {platform!r}")
+    # It tells at every start that it goes without an accelerator, which nobody needs.
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)
     try:
         import mujoco  # noqa: F401
     except (AttributeError, ImportError, OSError) as error:

@@ -21,7 +21,7 @@ from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.opengl import OpenGLError, load_mujoco
 from cpn_sim_worker.options import ServeConfig
-from cpn_sim_worker.session import REMINDER_SECONDS, ConfigError, StoppedError, open_session
+from cpn_sim_worker.session import REMINDER_SECONDS, ConfigError, StoppedError, open_session, zenoh_config
 from cpn_sim_worker.wire import RequestError, decode, encoding
 
 if TYPE_CHECKING:
@@ -198,6 +198,8 @@ def serve(config: ServeConfig) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
 
+    # A fault of the options is told before anything is loaded.
+    zenoh_config(config.zenoh)
     with ExitStack() as network, ThreadPoolExecutor(1) as joining:
 
         def join() -> zenoh.Session:

@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args
 
+import tyro
 import zenoh
 from google.protobuf.message import Message
 
@@ -27,6 +28,16 @@ M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
 Mode = Literal["peer", "client", "router"]
+
+
+def _default_hint(default: str) -> str:
+    """The end of an option's help, where tyro writes a list of one."""
+    return f"(default: {default.strip('[]').strip(chr(39))})"
+
+
+# Without constructors of their own, a namespace by the name of None would be none.
+Text = Annotated[str | None, tyro.conf.arg(constructor=str, help_behavior_hint=_default_hint)]
+File = Annotated[Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint=_default_hint)]
 
 MAX_MESSAGE_BYTES = 16 << 20
 """Largest message that is put together from fragments. Zenoh's own bound is 1 GiB."""
@@ -103,20 +114,20 @@ class ZenohConfig:
     listen: tuple[str, ...] = field(default_factory=_from_environment("CPN_LISTEN", _split, ()))
     """Endpoints to listen on; by default any free port of the loopback interface, and none for a client. CPN_LISTEN,
     separated by commas."""
-    namespace: str | None = field(default_factory=_from_environment("CPN_NAMESPACE", str, None))
+    namespace: Text = field(default_factory=_from_environment("CPN_NAMESPACE", str, None))
     """Prefix of every key, which keeps apart runs that share a network. CPN_NAMESPACE."""
-    zenoh_config: Path | None = field(default_factory=_from_environment("ZENOH_CONFIG", Path, None))
+    zenoh_config: File = field(default_factory=_from_environment("ZENOH_CONFIG", Path, None))
     """Zenoh's own configuration file (.json5, .json or .yaml), in place of the defaults here; options that are given
     win over it. ZENOH_CONFIG."""
-    user: str | None = field(default_factory=_from_environment("CPN_USER", str, None))
+    user: Text = field(default_factory=_from_environment("CPN_USER", str, None))
     """User name for routers that ask for one. CPN_USER."""
-    password_file: Path | None = field(default_factory=_from_environment("CPN_PASSWORD_FILE", Path, None))
+    password_file: File = field(default_factory=_from_environment("CPN_PASSWORD_FILE", Path, None))
     """File with the user's password. CPN_PASSWORD_FILE."""
-    tls_ca: Path | None = field(default_factory=_from_environment("CPN_TLS_CA", Path, None))
+    tls_ca: File = field(default_factory=_from_environment("CPN_TLS_CA", Path, None))
     """Certificate authority of everybody in the network, in PEM. CPN_TLS_CA."""
-    tls_certificate: Path | None = field(default_factory=_from_environment("CPN_TLS_CERTIFICATE", Path, None))
+    tls_certificate: File = field(default_factory=_from_environment("CPN_TLS_CERTIFICATE", Path, None))
     """Certificate of this process, in PEM, for its tls/ endpoints of both directions. CPN_TLS_CERTIFICATE."""
-    tls_private_key: Path | None = field(default_factory=_from_environment("CPN_TLS_PRIVATE_KEY", Path, None))
+    tls_private_key: File = field(default_factory=_from_environment("CPN_TLS_PRIVATE_KEY", Path, None))
     """Private key of the certificate, in PEM. CPN_TLS_PRIVATE_KEY."""
     insecure: bool = field(default_factory=_from_environment("CPN_INSECURE", _boolean, False))
     """Allows listening beyond the loopback interface without TLS. CPN_INSECURE."""
