@@ -131,7 +131,7 @@ pub(crate) enum State {
     New,
     /// One for each thread.
     Descents(Vec<Descent>),
-    Sampling(Sampling),
+    Sampling(Box<Sampling>),
     /// It was done at once.
     Whole(Vec<Plan>),
 }

@@ -246,7 +246,9 @@ impl Method for Planner {
                 let begun = workers.iter_mut().zip(queries.chunks(share)).map(begin).collect();
                 ongoing.state = State::Descents(begun);
             }
-            State::New => ongoing.state = State::Sampling(Sampling::begin(&mut workers[0], dynamics, queries[0])),
+            State::New => {
+                ongoing.state = State::Sampling(Box::new(Sampling::begin(&mut workers[0], dynamics, queries[0])))
+            }
             State::Descents(descents) => {
                 let mut rest = queries;
                 let mut parts: Vec<_> = workers
