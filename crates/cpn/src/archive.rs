@@ -1,5 +1,6 @@
 //! Named tensors and one JSON document in a safetensors file.
 
+use crate::unique;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::Serialize;
@@ -48,7 +49,8 @@ pub fn to_bytes<M: Serialize>(tensors: &Tensors, metadata: &M) -> Result<Vec<u8>
 pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), ArchiveError> {
     let header_bytes = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if header_bytes > MAX_HEADER_BYTES {
-        return Err(ArchiveError(format!("header: expected at most {MAX_HEADER_BYTES} bytes, got {header_bytes}")));
+        // Not how many: of a file that is none of these, that would be its first bytes.
+        return Err(ArchiveError(format!("header: expected at most {MAX_HEADER_BYTES} bytes, got more")));
     }
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| ArchiveError(e.to_string()))?;
     let json = header
@@ -56,6 +58,10 @@ pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), Arc
         .as_ref()
         .and_then(|metadata| metadata.get(METADATA_KEY))
         .ok_or_else(|| ArchiveError(format!("metadata: expected the key \"{METADATA_KEY}\", got none")))?;
+    // The library has found the header whole.
+    let header = bytes.get(size_of::<u64>()..).and_then(|rest| rest.get(..header_bytes as usize)).unwrap_or_default();
+    unique::check(header).map_err(|e| ArchiveError(format!("header: {e}")))?;
+    unique::check(json.as_bytes()).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
     let document = serde_json::from_str(json).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
     let file = SafeTensors::deserialize(bytes).map_err(|e| ArchiveError(e.to_string()))?;
     let tensors = file

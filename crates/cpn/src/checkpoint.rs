@@ -4,6 +4,7 @@ use crate::agent::Agent;
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
 use crate::recipe::Training;
+use crate::unique;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -79,10 +80,15 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     // The version first: another one's metadata has other fields.
     let (tensors, document): (_, Value) = archive::from_bytes(bytes)?;
     if document["format"] != FORMAT {
-        return Err(CheckpointError::Format { got: document["format"].to_string() });
+        let got = document["format"].as_u64().map_or_else(|| "no number".to_owned(), |format| format.to_string());
+        return Err(CheckpointError::Format { got });
     }
     let metadata: Metadata = serde_json::from_value(document).map_err(CheckpointError::Metadata)?;
     metadata.model.validate()?;
+    let render_spec = &metadata.provenance.render_spec;
+    if !render_spec.is_empty() {
+        unique::check(render_spec.as_bytes()).map_err(CheckpointError::RenderSpec)?;
+    }
     let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
     let mut agent = Agent::new(metadata.model, 0);
     copy_weights(&tensors, &agent)?;
@@ -143,6 +149,9 @@ pub enum CheckpointError {
     /// Metadata that lack a field or have an unknown one.
     #[error("checkpoint metadata: {0}")]
     Metadata(serde_json::Error),
+    /// A description of how the frames were rendered that is no JSON.
+    #[error("checkpoint provenance.render_spec: expected nothing or JSON, got {0}")]
+    RenderSpec(serde_json::Error),
     /// A configuration out of range.
     #[error("checkpoint model: {0}")]
     Config(#[from] ConfigError),

@@ -34,6 +34,7 @@ pub mod method;
 pub mod neuromodulated;
 pub mod positions;
 pub mod recipe;
+mod unique;
 
 pub use agent::Agent;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};

@@ -87,7 +87,70 @@ fn an_oversized_file_is_refused() {
 #[test]
 fn an_oversized_header_is_refused_unparsed() {
     let message = refusal(|_, metadata| metadata["provenance"]["render_spec"] = json!("x".repeat(1 << 20)));
-    assert!(message.starts_with("checkpoint: safetensors: header: expected at most 1048576 bytes, got "), "{message}");
+    assert!(
+        message.starts_with("checkpoint: safetensors: header: expected at most 1048576 bytes, got more"),
+        "{message}"
+    );
+}
+
+/// A checkpoint whose header `spoil` has made another one, of text.
+fn with_header(spoil: impl FnOnce(String) -> String) -> String {
+    let bytes = saved();
+    let length = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+    let (header, data) = bytes[8..].split_at(length);
+    let header = spoil(String::from_utf8(header.to_vec()).unwrap());
+    let file = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), data].concat();
+    checkpoint::from_bytes(&file).map_or_else(|error| error.to_string(), |_| "accepted".to_owned())
+}
+
+/// What stands twice is refused, wherever it does: two readers might see two different things.
+#[test]
+fn what_stands_twice_is_refused() {
+    assert_eq!(with_header(|header| header), "accepted");
+    let tensor = |header: &str| {
+        let start = header.find("\"step_size\":").unwrap();
+        let end = start + header[start..].find('}').unwrap() + 1;
+        header[start..end].to_owned()
+    };
+    let twice = |header: String, part: &str| header.replacen(part, &format!("{part},{part}"), 1);
+    for (refused, got) in [
+        (
+            with_header(|header| {
+                let part = tensor(&header);
+                twice(header, &part)
+            }),
+            "\"step_size\" twice",
+        ),
+        (with_header(|header| twice(header, r#"\"format\":3"#)), "\"format\" twice"),
+        (with_header(|header| twice(header, r#"\"seed\":5"#)), "\"seed\" twice"),
+        (with_header(|header| twice(header, r#""dtype":"F32""#)), ""),
+    ] {
+        assert!(refused.starts_with("checkpoint: safetensors: ") && refused.contains(got), "{got}: {refused}");
+    }
+}
+
+#[test]
+fn a_render_spec_is_json_or_nothing() {
+    let spec = |text: &str| refusal(|_, metadata| metadata["provenance"]["render_spec"] = text.into());
+    for text in ["blender", "{\"camera\":", "{} {}", "{\"a\":1,\"a\":2}"] {
+        let message = spec(text);
+        assert!(message.starts_with("checkpoint provenance.render_spec: expected nothing or JSON, got "), "{message}");
+    }
+}
+
+/// What a file that was named by mistake, or with intent, begins with is nobody's business.
+#[test]
+fn a_refusal_shows_no_bytes_of_a_file() {
+    let secret = b"-----BEGIN PRIVATE KEY-----\nMIGHAgEAMBMGByqGSM49AgEGCCqGSM49AwEHBG0wawIBAQQg";
+    let mut short = vec![0; 8];
+    short[0] = 10;
+    for bytes in [&secret[..], &[&short[..], &b"secret"[..]].concat(), &[&short[..], &b"{\"secret\":"[..]].concat()] {
+        let message = checkpoint::from_bytes(bytes).unwrap_err().to_string();
+        let first = u64::from_le_bytes(*bytes.first_chunk().unwrap()).to_string();
+        let shown =
+            message.contains("secret") || message.contains("BEGIN") || first.len() > 2 && message.contains(&first);
+        assert!(!shown, "{message}");
+    }
 }
 
 #[test]
@@ -95,7 +158,7 @@ fn another_format_is_refused() {
     assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 3, got 1");
     // An older one lacks fields: that it is older is what counts.
     assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 3, got 1");
-    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 3, got null");
+    assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 3, got no number");
 }
 
 #[test]

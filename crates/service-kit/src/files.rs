@@ -4,7 +4,7 @@ use anyhow::{Context, bail};
 use std::ffi::OsStr;
 use std::fs::{File, Permissions};
 use std::io::{Read, Write};
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 /// How the names of temporary files begin.
@@ -94,6 +94,30 @@ pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     }
     let mut bytes = Vec::new();
     File::open(path)?.take(max_bytes as u64).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The same of a file of this name in a folder: never of one elsewhere, to which a symbolic link leads.
+///
+/// # Errors
+/// If it cannot be read, is no regular file, or lies elsewhere.
+pub fn read_inside(folder: &Path, name: &str, max_bytes: usize) -> std::io::Result<Vec<u8>> {
+    let other = std::io::Error::other;
+    let path = folder.join(name).canonicalize()?;
+    if !path.starts_with(folder.canonicalize()?) {
+        return Err(other("a link to a file outside the folder"));
+    }
+    let found = path.symlink_metadata()?;
+    if !found.is_file() {
+        return Err(other("not a regular file"));
+    }
+    let file = File::open(&path)?;
+    let opened = file.metadata()?;
+    if (found.dev(), found.ino()) != (opened.dev(), opened.ino()) {
+        return Err(other("another file by now"));
+    }
+    let mut bytes = Vec::new();
+    file.take(max_bytes as u64).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 

@@ -75,7 +75,7 @@ impl Model {
             }
             CheckpointSource::File(name) => {
                 // One byte more than a checkpoint may have, so that it is refused as too large.
-                let read = files::read_at_most(&folder.join(&name), checkpoint::MAX_BYTES + 1);
+                let read = files::read_inside(folder, &name, checkpoint::MAX_BYTES + 1);
                 let bytes = read.map_err(|e| match e.kind() {
                     io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", &name),
                     _ => Error::invalid("file", "a readable file", format!("{name}: {e}")),

@@ -48,8 +48,8 @@ impl Signatures {
     pub(crate) fn check_file(&self, folder: &Path, name: &str, bytes: &[u8]) -> Result<(), Error> {
         self.judge(name, || {
             // One byte more than a bundle may have, so that it is refused as too large.
-            let path = folder.join(format!("{name}.{}", signing::EXTENSION));
-            let bundle = match files::read_at_most(&path, signing::MAX_BYTES + 1) {
+            let beside = format!("{name}.{}", signing::EXTENSION);
+            let bundle = match files::read_inside(folder, &beside, signing::MAX_BYTES + 1) {
                 Ok(bundle) => Some(bundle),
                 Err(error) if error.kind() == ErrorKind::NotFound => None,
                 Err(error) => return Err(unreadable(&error)),
