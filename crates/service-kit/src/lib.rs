@@ -2,6 +2,7 @@
 //! with TLS and access control for gRPC and others.
 
 pub mod access;
+pub mod changes;
 pub mod config;
 pub mod files;
 pub mod grpc;

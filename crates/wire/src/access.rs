@@ -128,6 +128,7 @@ pub const ENDPOINTS: &[Endpoint] = &[
         max_bytes: LoadModelRequest::MAX_BYTES,
         ..query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel")
     },
+    query(|| key::planner_unload_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/UnloadModel"),
     zenoh(Kind::Query, || key::sim_reset("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Query, || key::sim_step("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Publication, || key::sim_frame("*"), &[Worker], &[Viewer]),

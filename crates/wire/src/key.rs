@@ -32,6 +32,8 @@ keys! {
     planner_register_goal(planner) = "cpn/@v1/planner/${planner:*}/register_goal";
     /// Queryable: [`crate::planner::LoadModelRequest`].
     planner_load_model(planner) = "cpn/@v1/planner/${planner:*}/load_model";
+    /// Queryable: [`crate::planner::UnloadModelRequest`].
+    planner_unload_model(planner) = "cpn/@v1/planner/${planner:*}/unload_model";
     /// Queryable: [`crate::planner::ListModelsRequest`].
     planner_list_models(planner) = "cpn/@v1/planner/${planner:*}/list_models";
     /// Queryable: [`crate::sim::ResetRequest`].

@@ -7,6 +7,8 @@ use std::time::Duration;
 
 /// Most actions of a plan.
 const MAX_HORIZON: usize = 64;
+/// Largest number, up or down, of an action that a search begins with; what is executed is clipped to 1.
+const MAX_START: f32 = 1000.0;
 
 /// Where to plan to.
 #[derive(Debug, Clone, PartialEq)]
@@ -115,6 +117,17 @@ pub struct LoadModelResponse {
     pub model: ModelInfo,
 }
 
+/// Serves a model no longer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct UnloadModelRequest {
+    /// Name the model is served under.
+    pub model: String,
+}
+
+/// The model is no longer served.
+#[derive(Debug, Clone, PartialEq)]
+pub struct UnloadModelResponse;
+
 /// Asks for the served models.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ListModelsRequest;
@@ -148,6 +161,15 @@ fn actions(field: &str, actions: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Er
         return Err(Error::invalid(field, format!("at most {MAX_HORIZON} actions"), actions.len()));
     }
     actions.into_iter().map(action).collect::<Result<_, _>>().map_err(|e| e.within(field))
+}
+
+/// Actions from which numbers of no sense cannot follow.
+fn start(field: &str, start: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Error> {
+    let start = actions(field, start)?;
+    match start.iter().flatten().find(|value| value.abs() > MAX_START) {
+        Some(value) => Err(Error::invalid(field, format!("numbers from -{MAX_START} to {MAX_START}"), value)),
+        None => Ok(start),
+    }
 }
 
 impl PlanRequest {
@@ -205,7 +227,7 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 .then(|| digest("model_digest", request.model_digest))
                 .transpose()?,
             search,
-            warm_start: actions("warm_start", request.warm_start)?,
+            warm_start: start("warm_start", request.warm_start)?,
         })
     }
 }
@@ -357,6 +379,42 @@ impl TryFrom<proto::LoadModelResponse> for LoadModelResponse {
 impl From<LoadModelResponse> for proto::LoadModelResponse {
     fn from(response: LoadModelResponse) -> Self {
         Self { model: Some(response.model.into()) }
+    }
+}
+
+impl Message for UnloadModelRequest {
+    type Proto = proto::UnloadModelRequest;
+}
+
+impl TryFrom<proto::UnloadModelRequest> for UnloadModelRequest {
+    type Error = Error;
+
+    fn try_from(request: proto::UnloadModelRequest) -> Result<Self, Error> {
+        Ok(Self { model: name("model", request.model)? })
+    }
+}
+
+impl From<UnloadModelRequest> for proto::UnloadModelRequest {
+    fn from(request: UnloadModelRequest) -> Self {
+        Self { model: request.model }
+    }
+}
+
+impl Message for UnloadModelResponse {
+    type Proto = proto::UnloadModelResponse;
+}
+
+impl TryFrom<proto::UnloadModelResponse> for UnloadModelResponse {
+    type Error = Error;
+
+    fn try_from(_: proto::UnloadModelResponse) -> Result<Self, Error> {
+        Ok(Self)
+    }
+}
+
+impl From<UnloadModelResponse> for proto::UnloadModelResponse {
+    fn from(_: UnloadModelResponse) -> Self {
+        Self {}
     }
 }
 

@@ -24,6 +24,7 @@ fn keys_are_the_ones_agreed_upon() {
             "planner_plan" => key::planner_plan(&chunk("planner")),
             "planner_register_goal" => key::planner_register_goal(&chunk("planner")),
             "planner_load_model" => key::planner_load_model(&chunk("planner")),
+            "planner_unload_model" => key::planner_unload_model(&chunk("planner")),
             "planner_list_models" => key::planner_list_models(&chunk("planner")),
             "trainer_alive" => key::trainer_alive(&chunk("trainer")),
             "planner_alive" => key::planner_alive(&chunk("planner")),
@@ -40,7 +41,7 @@ fn keys_are_the_ones_agreed_upon() {
         };
         assert_eq!(key.unwrap().as_str(), entry["key"], "{name}");
     }
-    assert_eq!(golden.len(), 23, "every key is in the file");
+    assert_eq!(golden.len(), 24, "every key is in the file");
 }
 
 #[test]

@@ -50,7 +50,7 @@ fn each_wrong_field_is_named() {
         Some(proto::Search { solver: solver.into(), samples, anytime, ..Default::default() })
     };
     let action = |count| proto::Action { values: vec![0.0; count] };
-    let cases: [(Error, &str, &str, &str); 17] = [
+    let cases: [(Error, &str, &str, &str); 18] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -93,6 +93,12 @@ fn each_wrong_field_is_named() {
         (refusal(|r| r.search = search(proto::Solver::Gradient, 8, false)), "search.samples", "none for GRADIENT", "8"),
         (refusal(|r| r.search = search(proto::Solver::Mppi, 8, true)), "deadline_ms", "a limit", "0"),
         (refusal(|r| r.warm_start = vec![action(4); 65]), "warm_start", "at most 64 actions", "65"),
+        (
+            refusal(|r| r.warm_start = vec![action(4), proto::Action { values: vec![0.5, -1e4] }]),
+            "warm_start",
+            "numbers from -1000 to 1000",
+            "-10000",
+        ),
     ];
     for (error, field, expected, got) in cases {
         assert_eq!(error.code, Code::InvalidArgument);

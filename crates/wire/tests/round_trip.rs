@@ -198,7 +198,9 @@ proptest! {
     ) {
         survives(RegisterGoalRequest { image });
         survives(RegisterGoalResponse { goal_id });
-        survives(LoadModelRequest { model, source });
+        survives(LoadModelRequest { model: model.clone(), source });
+        survives(UnloadModelRequest { model });
+        survives(UnloadModelResponse);
         survives(LoadModelResponse { model: info });
         survives(ListModelsRequest);
         survives(ListModelsResponse { models });

@@ -4,10 +4,10 @@ use crate::config::Config;
 use crate::goals::Goals;
 use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
-use crate::served::unknown_model;
+use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask, Reply};
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
@@ -15,7 +15,7 @@ use tracing::{Span, info, warn};
 use wire::checkpoint::CheckpointManifest;
 use wire::planner::{
     CheckpointSource, Goal, ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest,
-    PlanResponse, RegisterGoalRequest, RegisterGoalResponse,
+    PlanResponse, RegisterGoalRequest, RegisterGoalResponse, UnloadModelRequest, UnloadModelResponse,
 };
 use wire::{Code, Error, Image, Observation};
 
@@ -33,6 +33,7 @@ pub struct PlannerCore {
     models_dir: Arc<Path>,
     signatures: Arc<Signatures>,
     computing: Computing,
+    model_capacity: usize,
 }
 
 impl PlannerCore {
@@ -50,6 +51,8 @@ impl PlannerCore {
         let signatures = Arc::new(Signatures::new(config)?);
         let (folder, checked) = (config.models_dir.clone(), Arc::clone(&signatures));
         let models = tokio::task::spawn_blocking(move || load_all(&folder, &checked, computing)).await??;
+        let (capacity, got) = (usize::from(config.model_capacity.get()), models.len());
+        ensure!(got <= capacity, "model_capacity: expected room for the {got} models that are there, got {capacity}");
         for Model { info, .. } in &models {
             info!(model = info.name, method = info.method, digest = info.digest, "serving");
         }
@@ -60,6 +63,7 @@ impl PlannerCore {
             models_dir: config.models_dir.clone().into(),
             signatures,
             computing,
+            model_capacity: capacity,
         })
     }
 
@@ -136,9 +140,10 @@ impl PlannerCore {
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint, with the reason; `NOT_FOUND` for a file that is not in the model
     /// folder; `FAILED_PRECONDITION` for the name `random`, or if no trusted key signed it and that is refused;
-    /// `RESOURCE_EXHAUSTED` if others are being loaded.
+    /// `RESOURCE_EXHAUSTED` if others are being loaded, or the name is new and one too many.
     pub async fn load_model(&self, request: LoadModelRequest) -> Result<LoadModelResponse, Error> {
         check_replaceable(&request.model)?;
+        self.check_capacity(&request.model)?;
         let _load = self.loads.try_acquire().map_err(|_| {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
@@ -153,19 +158,40 @@ impl PlannerCore {
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint or another one, with the reason; `FAILED_PRECONDITION` for the name
-    /// `random`, or if no trusted key signed it and that is refused; those of `fetch`.
+    /// `random`, or if no trusted key signed it and that is refused; `RESOURCE_EXHAUSTED` if the name is new and one too many;
+    /// those of `fetch`.
     pub(crate) async fn load_published(
         &self,
         manifest: CheckpointManifest,
         fetch: impl Future<Output = Result<Vec<u8>, Error>>,
     ) -> Result<(), Error> {
         check_replaceable(&manifest.model)?;
+        self.check_capacity(&manifest.model)?;
         self.signatures.check_published(&manifest)?;
         let bytes = fetch.await?;
         // It comes once and unasked, so that it waits where a client would be sent away.
         let _load = self.loads.acquire().await;
         let computing = self.computing;
         self.swap_in(move || Model::published(manifest, &bytes, computing)).await.map(drop)
+    }
+
+    /// Serves a model no longer. Searches that go on with it are finished; who names one of its checkpoints gets none.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown name; `FAILED_PRECONDITION` for `random`; `UNAVAILABLE` during shutdown.
+    pub async fn unload_model(
+        &self,
+        UnloadModelRequest { model }: UnloadModelRequest,
+    ) -> Result<UnloadModelResponse, Error> {
+        check_replaceable(&model)?;
+        self.thread.unload(model.clone()).await?;
+        info!(model, "no longer serving");
+        Ok(UnloadModelResponse)
+    }
+
+    /// Whether there is room for a model of this name, before its checkpoint is read.
+    fn check_capacity(&self, model: &str) -> Result<(), Error> {
+        check_capacity(model, self.thread.models().keys(), self.model_capacity)
     }
 
     async fn swap_in(&self, load: impl FnOnce() -> Result<Model, Error> + Send + 'static) -> Result<ModelInfo, Error> {

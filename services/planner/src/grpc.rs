@@ -1,5 +1,6 @@
 //! The planner over gRPC: translation.
 
+use crate::CHANGES;
 use crate::core::PlannerCore;
 use service_kit::GrpcServer;
 use service_kit::access::Access;
@@ -30,6 +31,7 @@ pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Acces
         .into_axum_router()
         .route_service(LOAD_MODEL_PATH, service(LoadModelRequest::MAX_BYTES))
         .layer(MapResponseLayer::new(name_unreadable_payload));
+    let planner = CHANGES.watch(planner);
     let name = PlannerServiceServer::<Grpc>::NAME;
     GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(planner)).await
 }
@@ -58,6 +60,13 @@ impl PlannerService for Grpc {
         request: Request<proto::LoadModelRequest>,
     ) -> Result<Response<proto::LoadModelResponse>, Status> {
         answer(request, |request| self.0.load_model(request)).await
+    }
+
+    async fn unload_model(
+        &self,
+        request: Request<proto::UnloadModelRequest>,
+    ) -> Result<Response<proto::UnloadModelResponse>, Status> {
+        answer(request, |request| self.0.unload_model(request)).await
     }
 
     async fn list_models(

@@ -27,12 +27,22 @@ pub use config::Config;
 #[doc(hidden)]
 pub use openpi::request as openpi_request; // for the fuzzer
 use service_kit::access::Access;
+use service_kit::changes::Changes;
 use service_kit::session::Connection;
 use service_kit::{GrpcServer, metrics};
 use std::net::SocketAddr;
 use std::time::Duration;
 use tracing::{info, warn};
 use wire::access;
+
+/// What can be changed of a planner.
+pub(crate) const CHANGES: Changes = Changes {
+    metric: "cpn_planner_changes_refused_total",
+    methods: &[
+        ("/cpn.v1.PlannerService/LoadModel", "load_model"),
+        ("/cpn.v1.PlannerService/UnloadModel", "unload_model"),
+    ],
+};
 
 /// How long requests in flight may take to finish at shutdown.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);

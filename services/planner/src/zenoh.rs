@@ -1,5 +1,6 @@
 //! The planner over zenoh: queryables, announced checkpoints, a liveliness token.
 
+use crate::CHANGES;
 use crate::config::Config;
 use crate::core::PlannerCore;
 use crate::follow::Follower;
@@ -56,16 +57,22 @@ impl ZenohServer {
         let queryables = vec![
             requests.serve_plans(plan).await?,
             requests
-                .serve(key::planner_register_goal(&config.name)?, |core, request| ready(core.register_goal(request)))
+                .serve(key::planner_register_goal(&config.name)?, None, |core, request| {
+                    ready(core.register_goal(request))
+                })
                 .await?,
             requests
-                .serve(
-                    key::planner_load_model(&config.name)?,
-                    |core, request| async move { core.load_model(request).await },
-                )
+                .serve(key::planner_load_model(&config.name)?, Some("load_model"), |core, request| async move {
+                    core.load_model(request).await
+                })
                 .await?,
             requests
-                .serve(key::planner_list_models(&config.name)?, |core, _: ListModelsRequest| {
+                .serve(key::planner_unload_model(&config.name)?, Some("unload_model"), |core, request| async move {
+                    core.unload_model(request).await
+                })
+                .await?,
+            requests
+                .serve(key::planner_list_models(&config.name)?, None, |core, _: ListModelsRequest| {
                     ready(Ok(core.list_models()))
                 })
                 .await?,
@@ -80,7 +87,8 @@ impl ZenohServer {
             while let Ok(sample) = subscriber.recv_async().await {
                 if let Err(error) = follower.follow(&sample.payload().to_bytes()).await {
                     let key = sample.key_expr();
-                    warn!(%key, %error, "announced checkpoint refused; the old one serves on");
+                    // The old one serves on.
+                    CHANGES.refused("announcement", key, &error);
                 }
             }
         }));
@@ -167,8 +175,13 @@ impl Requests {
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }
 
-    /// Declares another queryable. Zenoh's callback only starts a task: it must not block the network thread.
-    async fn serve<Q, R, F, S>(&self, key: OwnedKeyExpr, serve: S) -> anyhow::Result<Queryable<()>>
+    /// Declares another queryable, which may be for a change. Zenoh's callback only starts a task: it must not block the network thread.
+    async fn serve<Q, R, F, S>(
+        &self,
+        key: OwnedKeyExpr,
+        change: Option<&'static str>,
+        serve: S,
+    ) -> anyhow::Result<Queryable<()>>
     where
         Q: Message + Send,
         R: Message + Send,
@@ -188,6 +201,9 @@ impl Requests {
                     (Ok(_), Err(error)) => Err(error),
                     (Ok(_), Ok(request)) => serve(core, request).await,
                 };
+                if let (Some(change), Err(error)) = (change, &result) {
+                    CHANGES.refused(change, query.key_expr(), error);
+                }
                 reply(&query, &own, result);
             };
             tasks.spawn_on(answer.instrument(span), &runtime);

@@ -73,6 +73,69 @@ async fn a_sound_checkpoint_is_served_from_bytes_and_files() {
     }
 }
 
+/// As many names as there is room for are served; one that is unloaded makes room for another.
+#[tokio::test(flavor = "multi_thread")]
+async fn names_are_bounded_and_can_be_freed() {
+    let fixture = Fixture::start(&[("cpn", cpn(1))], |config| config.model_capacity = 3.try_into().unwrap()).await;
+    for client in fixture.clients() {
+        let refused = |code: Code, error: wire::Error| {
+            assert_eq!((error.code, error.field.as_str()), (code, "model"), "{}: {error}", client.transport());
+        };
+        client.load_model(from_bytes("third", cpn(2))).await.unwrap();
+        refused(Code::ResourceExhausted, client.load_model(from_bytes("fourth", cpn(3))).await.unwrap_err());
+        client.load_model(from_bytes("third", cpn(3))).await.unwrap();
+        client.load_model(from_bytes("cpn", cpn(2))).await.unwrap();
+
+        client.unload_model("third").await.unwrap();
+        is(Code::NotFound, "model", client.plan(plan_request("third", 1)).await);
+        let names: Vec<_> = client.list_models().await.unwrap().models.into_iter().map(|info| info.name).collect();
+        assert_eq!(names, ["cpn", "random"]);
+        refused(Code::NotFound, client.unload_model("third").await.unwrap_err());
+        refused(Code::FailedPrecondition, client.unload_model("random").await.unwrap_err());
+        client.load_model(from_bytes("fourth", cpn(3))).await.unwrap();
+        client.unload_model("fourth").await.unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_folder_with_too_many_models_is_refused() {
+    let models_dir = tempfile::TempDir::new().unwrap();
+    for name in ["a", "b"] {
+        std::fs::write(models_dir.path().join(format!("{name}.safetensors")), cpn(1)).unwrap();
+    }
+    let config = planner::Config {
+        models_dir: models_dir.path().into(),
+        model_capacity: 2.try_into().unwrap(),
+        grpc_listen: ([127, 0, 0, 1], 0).into(),
+        ..planner::Config::default()
+    };
+    let error = planner::start(config).await.unwrap_err();
+    assert_eq!(error.to_string(), "model_capacity: expected room for the 3 models that are there, got 2");
+}
+
+/// A file that lies elsewhere is not opened, though a link leads to it, and nothing of it is told.
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_outside_the_folder_is_opened() {
+    let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
+    let (folder, elsewhere) = (fixture.models_dir.path(), tempfile::TempDir::new().unwrap());
+    std::fs::write(elsewhere.path().join("sound.safetensors"), cpn(2)).unwrap();
+    std::fs::write(elsewhere.path().join("secret"), "-----BEGIN PRIVATE KEY-----").unwrap();
+    for file in ["sound.safetensors", "secret"] {
+        std::os::unix::fs::symlink(elsewhere.path().join(file), folder.join(file)).unwrap();
+    }
+    std::os::unix::fs::symlink(elsewhere.path(), folder.join("folder")).unwrap();
+    std::os::unix::fs::symlink("cpn.safetensors", folder.join("inside.safetensors")).unwrap();
+    let first = u64::from_le_bytes(*b"-----BEG").to_string();
+    for client in fixture.clients() {
+        for file in ["sound.safetensors", "secret", "folder"] {
+            let error = client.load_model(from_file("cpn", file)).await.unwrap_err();
+            assert_eq!((error.code, error.field.as_str()), (Code::InvalidArgument, "file"), "{file}: {error}");
+            assert!(error.got.contains("outside the folder") && !error.to_string().contains(&first), "{error}");
+        }
+        client.load_model(from_file("cpn", "inside.safetensors")).await.unwrap();
+    }
+}
+
 /// Two checkpoints change places fifty times while every transport plans: no plan fails, and each is, to the bit, that
 /// of the checkpoint it names.
 #[tokio::test(flavor = "multi_thread")]

@@ -1,6 +1,7 @@
 //! Training runs over gRPC: translation.
 
 use crate::runs::Runs;
+use crate::service::CHANGES;
 use futures::StreamExt;
 use futures::stream::BoxStream;
 use service_kit::GrpcServer;
@@ -26,6 +27,7 @@ use wire::{Code, Error, Message, proto};
 pub(crate) async fn start(runs: Runs, listen: ListenConfig, access: Access) -> anyhow::Result<GrpcServer> {
     let service = TrainerServiceServer::new(Grpc(runs)).max_decoding_message_size(StartRunRequest::MAX_BYTES);
     let routes = Routes::new(service).into_axum_router().layer(MapResponseLayer::new(name_unreadable_payload));
+    let routes = CHANGES.watch(routes);
     let name = TrainerServiceServer::<Grpc>::NAME;
     GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(routes)).await
 }

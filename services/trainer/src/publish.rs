@@ -1,6 +1,7 @@
 //! Publishing over zenoh: planners are told which version of each model to serve and fetch it piece by piece; people list,
 //! promote and roll back.
 
+use crate::service::CHANGES;
 use crate::versions::Versions;
 use anyhow::anyhow;
 use backon::{ConstantBuilder, Retryable};
@@ -33,10 +34,11 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// If zenoh refuses a declaration.
 pub async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Result<JoinSet<anyhow::Result<()>>> {
     let mut tasks = JoinSet::new();
-    serve(&mut tasks, session, key::checkpoint_chunk("*")?, versions, Versions::chunk).await?;
-    serve(&mut tasks, session, key::checkpoint_list_versions("*")?, versions, Versions::list).await?;
-    serve(&mut tasks, session, key::checkpoint_promote("*")?, versions, Versions::promote).await?;
-    serve(&mut tasks, session, key::checkpoint_roll_back("*")?, versions, Versions::roll_back).await?;
+    serve(&mut tasks, session, (key::checkpoint_chunk("*")?, None), versions, Versions::chunk).await?;
+    serve(&mut tasks, session, (key::checkpoint_list_versions("*")?, None), versions, Versions::list).await?;
+    serve(&mut tasks, session, (key::checkpoint_promote("*")?, Some("promote")), versions, Versions::promote).await?;
+    let roll_back = (key::checkpoint_roll_back("*")?, Some("roll_back"));
+    serve(&mut tasks, session, roll_back, versions, Versions::roll_back).await?;
     let planners = session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true);
     let planners = planners.await.map_err(|e| anyhow!(e))?;
     tasks.spawn(announce(session.clone(), planners, Arc::clone(versions)));
@@ -44,11 +46,11 @@ pub async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Resul
     Ok(tasks)
 }
 
-/// Answers a queryable's requests, one after the other, where they may block.
+/// Answers a queryable's requests, which may be for a change, one after the other, where they may block.
 async fn serve<Q, R>(
     tasks: &mut JoinSet<anyhow::Result<()>>,
     session: &Session,
-    key: OwnedKeyExpr,
+    (key, change): (OwnedKeyExpr, Option<&'static str>),
     versions: &Arc<Versions>,
     answer: fn(&Versions, Q) -> Result<R, Error>,
 ) -> anyhow::Result<()>
@@ -63,6 +65,9 @@ where
             let versions = Arc::clone(&versions);
             let answering = tokio::task::spawn_blocking(move || {
                 let result = query::request(&query).and_then(|request| answer(&versions, request));
+                if let (Some(change), Err(error)) = (change, &result) {
+                    CHANGES.refused(change, query.key_expr(), error);
+                }
                 if let Err(error) = query::reply(&query, result) {
                     warn!(%error, key = %query.key_expr(), "answer not sent");
                 }

@@ -2,6 +2,7 @@
 
 use crate::queries::serve;
 use crate::runs::Runs;
+use crate::service::CHANGES;
 use anyhow::{anyhow, ensure};
 use tokio::runtime::Handle;
 use tokio_util::task::AbortOnDropHandle;
@@ -9,7 +10,7 @@ use tracing::warn;
 use wire::training::{
     ListRunsRequest, ListRunsResponse, StartRunRequest, StartRunResponse, StopRunRequest, StopRunResponse,
 };
-use wire::{encode, key, query};
+use wire::{Error, encode, key, query};
 use zenoh::Session;
 use zenoh::query::{Query, Queryable};
 
@@ -32,12 +33,15 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
     let (core, own) = (runs.clone(), start_key.clone());
     let start = move |query: &Query| {
         let answer = query::request(query).and_then(|request: StartRunRequest| core.start(&request));
+        watch("start_run", query, &answer);
         query::reply_as(query, &own, answer.map(|run| StartRunResponse { run }))
     };
     let (core, own, runtime) = (runs.clone(), stop_key.clone(), Handle::current());
     let stop = move |query: &Query| {
         let stop = |request: StopRunRequest| runtime.block_on(core.stop(&request.name));
-        query::reply_as(query, &own, query::request(query).and_then(stop).map(|run| StopRunResponse { run }))
+        let answer = query::request(query).and_then(stop);
+        watch("stop_run", query, &answer);
+        query::reply_as(query, &own, answer.map(|run| StopRunResponse { run }))
     };
     let (core, own) = (runs.clone(), list_key.clone());
     let list = move |query: &Query| {
@@ -51,6 +55,13 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
     ];
     let publisher = AbortOnDropHandle::new(tokio::spawn(publish(session.clone(), runs.clone())));
     Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
+}
+
+/// A change that is refused leaves a trace.
+fn watch<R>(change: &'static str, query: &Query, answer: &Result<R, Error>) {
+    if let Err(error) = answer {
+        CHANGES.refused(change, query.key_expr(), error);
+    }
 }
 
 async fn publish(session: Session, runs: Runs) {

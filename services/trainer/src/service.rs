@@ -11,6 +11,7 @@ use crate::{grpc, runs_metrics};
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
 use service_kit::access::Access;
+use service_kit::changes::Changes;
 use service_kit::session::Connection;
 use service_kit::{GrpcServer, SessionConfig, metrics, session};
 use std::net::{Ipv4Addr, SocketAddr};
@@ -25,6 +26,12 @@ use zenoh::liveliness::LivelinessToken;
 
 /// How long requests in flight may take to finish at shutdown.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// What can be changed of a trainer.
+pub(crate) const CHANGES: Changes = Changes {
+    metric: "cpn_trainer_changes_refused_total",
+    methods: &[("/cpn.v1.TrainerService/StartRun", "start_run"), ("/cpn.v1.TrainerService/StopRun", "stop_run")],
+};
 
 /// Settings of the service.
 #[derive(Debug, Clone, Serialize, Deserialize)]

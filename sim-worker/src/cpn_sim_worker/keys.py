@@ -62,6 +62,11 @@ def planner_load_model(planner: str) -> str:
     return f"{ROOT}/planner/{planner}/load_model"
 
 
+def planner_unload_model(planner: str) -> str:
+    """Queryable: `UnloadModelRequest` to `UnloadModelResponse`."""
+    return f"{ROOT}/planner/{planner}/unload_model"
+
+
 def planner_list_models(planner: str) -> str:
     """Queryable: `ListModelsRequest` to `ListModelsResponse`."""
     return f"{ROOT}/planner/{planner}/list_models"

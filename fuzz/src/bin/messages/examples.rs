@@ -61,6 +61,8 @@ fn planner() -> Vec<Example> {
         example(LoadModelRequest { model: "cpn".into(), source: CheckpointSource::File("cpn.safetensors".into()) }),
         example(LoadModelRequest { model: "cpn".into(), source: CheckpointSource::Bytes(vec![7; 9]) }),
         example(LoadModelResponse { model: model.clone() }),
+        example(UnloadModelRequest { model: "cpn".into() }),
+        example(UnloadModelResponse),
         example(ListModelsRequest),
         example(ListModelsResponse { models: vec![model; 2] }),
         example(PlannedEpisode {

@@ -21,7 +21,7 @@ use tempfile::TempDir;
 use tonic::transport::Channel;
 use wire::planner::{
     ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest, PlanResponse, RegisterGoalRequest,
-    RegisterGoalResponse, StageTimes,
+    RegisterGoalResponse, StageTimes, UnloadModelRequest, UnloadModelResponse,
 };
 use wire::proto::planner_service_client::PlannerServiceClient;
 use wire::{Code, Error, Message, key, proto, query};
@@ -130,6 +130,15 @@ impl Client {
             Self::InProcess(core) => core.load_model(LoadModelRequest::try_from(request)?).await,
             Self::Grpc(grpc) => grpc.clone().load_model(request).await?.into_inner().try_into(),
             Self::Zenoh(session) => raw_query(session, &key::planner_load_model(NAME)?, encoded(&request)).await,
+        }
+    }
+
+    pub async fn unload_model(&self, model: &str) -> Result<UnloadModelResponse, Error> {
+        let request = proto::UnloadModelRequest { model: model.into() };
+        match self {
+            Self::InProcess(core) => core.unload_model(UnloadModelRequest::try_from(request)?).await,
+            Self::Grpc(grpc) => grpc.clone().unload_model(request).await?.into_inner().try_into(),
+            Self::Zenoh(session) => raw_query(session, &key::planner_unload_model(NAME)?, encoded(&request)).await,
         }
     }
 
