@@ -3,6 +3,7 @@
 import socket
 import subprocess
 import sys
+import urllib.request
 
 import numpy as np
 import pytest
@@ -65,6 +66,22 @@ def test_a_wrong_request_raises_and_the_next_is_answered(planner: Planner, pictu
         with pytest.raises(RuntimeError, match=error):
             policy.infer({**request, **change})
         assert policy.infer({**request, "prompt": ""})["actions"].shape == (5, 4)
+
+
+def test_scalars_come_in_all_forms_that_the_client_packs(planner: Planner, pictures: Pictures) -> None:
+    frame, goal = pictures
+    policy = planner.connect()
+    request = {"observation/image": frame, "goal/image": goal}
+    expected = policy.infer({**request, "model": "random", "seed": 3})["actions"]
+    for seed in (np.int64(3), np.uint8(3), np.array(3), np.array(3, np.int32)):
+        for model in (b"random", np.str_("random"), np.bytes_(b"random"), np.array("random")):
+            got = policy.infer({**request, "model": model, "seed": seed, "prompt": None, "goal/id": None})
+            np.testing.assert_array_equal(got["actions"], expected)
+
+
+def test_health_is_told_as_by_openpis_server(planner: Planner) -> None:
+    with urllib.request.urlopen(f"http://127.0.0.1:{planner.openpi_port}/healthz", timeout=60) as answer:
+        assert (answer.status, answer.read()) == (200, b"OK\n")
 
 
 def test_a_request_that_is_too_large_is_told_why(planner: Planner, pictures: Pictures) -> None:

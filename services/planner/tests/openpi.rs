@@ -173,6 +173,91 @@ async fn openpi_gets_the_answers_of_the_core() {
     fixture.planner.shutdown().await.unwrap();
 }
 
+/// A number or text of numpy's own types, as openpi's client packs it.
+fn generic(dtype: &str, data: impl Into<Value>) -> Value {
+    let key = |name: &str| Value::from(name.as_bytes());
+    Value::Map(vec![(key("__npgeneric__"), true.into()), (key("data"), data.into()), (key("dtype"), dtype.into())])
+}
+
+/// Every form in which Python programs hold a number, a text or nothing.
+#[tokio::test(flavor = "multi_thread")]
+async fn scalars_come_in_all_their_forms() {
+    let fixture = start(&[("cpn", checkpoint(MethodKind::Cpn, 1))]).await;
+    let [core, ..] = fixture.clients();
+    let mut client = Client::of(&fixture).await;
+    let plan = core.plan(plan_request(RANDOM, 3)).await.unwrap();
+    let wide = |text: &str| text.chars().flat_map(|letter| (letter as u32).to_le_bytes()).collect::<Vec<_>>();
+    let seeds = [
+        generic("<i8", 3),
+        generic("|u1", 3),
+        array("<i8", &[], 3_i64.to_le_bytes()),
+        array("<u4", &[], 3_u32.to_le_bytes()),
+        array("|i1", &[], [3]),
+    ];
+    let models = [
+        Value::Binary(RANDOM.into()),
+        generic("<U6", RANDOM),
+        array("<U6", &[], wide(RANDOM)),
+        array("|S8", &[], *b"random\0\0"),
+    ];
+    let prompts = [Value::Nil, Value::Binary(Vec::new()), generic("<U0", ""), array("<U1", &[], wide("\0"))];
+    for (at, seed) in seeds.into_iter().enumerate() {
+        let (model, prompt) = (models[at % models.len()].clone(), prompts[at % prompts.len()].clone());
+        let fields = [
+            ("observation/image", picture(3)),
+            ("goal/image", picture(0)),
+            ("goal/id", Value::Nil),
+            ("model", model),
+            ("seed", seed),
+            ("prompt", prompt),
+        ];
+        assert_same(&client.infer(packed(&fields)).await.unwrap_or_else(|e| panic!("{at}: {e}")), &plan);
+    }
+    let id = Value::Binary(plan.goal_id.clone().into());
+    let fields = [("observation/image", picture(3)), ("goal/id", id), ("model", RANDOM.into()), ("seed", 3.into())];
+    assert_same(&client.infer(packed(&fields)).await.unwrap(), &plan);
+
+    for (field, value, expected) in [
+        ("seed", generic("<i8", -3), "seed: expected an integer from 0"),
+        ("seed", generic("<f8", 3.5), "seed: expected an integer from 0"),
+        ("seed", array("<i8", &[1], 3_i64.to_le_bytes()), "seed: expected an integer from 0"),
+        ("seed", array("<i4", &[], (-3_i32).to_le_bytes()), "seed: expected an integer from 0"),
+        ("seed", array("<i8", &[], [0; 9]), "seed: expected an integer from 0"),
+        ("model", Value::Binary(vec![0xff]), "model: expected text, got 1 bytes"),
+        ("model", array("<U1", &[], [0, 0, 0, 0xff]), "model: expected text"),
+        ("prompt", generic("<U4", "push"), "prompt: expected none"),
+        ("prompt", Value::Binary(b"push".into()), "prompt: expected none"),
+    ] {
+        let refused = client.infer(spoiled(field, value)).await.unwrap_err();
+        assert!(refused.starts_with(expected), "{refused}");
+    }
+}
+
+/// What an HTTP client gets.
+async fn http(address: SocketAddr, request: &str) -> String {
+    let mut stream = TcpStream::connect(address).await.unwrap();
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    soon(stream.read_to_string(&mut answer)).await.unwrap();
+    answer
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn health_is_told_as_by_servers_of_openpi() {
+    let fixture = start(&[]).await;
+    let address = fixture.planner.openpi_address().unwrap();
+    let well = http(address, "GET /healthz HTTP/1.1\r\nHost: planner\r\n\r\n").await;
+    assert!(well.starts_with("HTTP/1.1 200 OK\r\n") && well.ends_with("\r\n\r\nOK\n"), "{well}");
+    let refused = http(address, "GET / HTTP/1.1\r\nHost: planner\r\n\r\n").await;
+    assert!(refused.starts_with("HTTP/1.1 400 Bad Request\r\n"), "{refused}");
+    // A head without an end is read no further than to its limit.
+    let mut stream = TcpStream::connect(address).await.unwrap();
+    let endless = format!("GET /{} HTTP/1.1\r\n", "x".repeat(32 << 10));
+    let _ = stream.write_all(endless.as_bytes()).await;
+    let _ = soon(stream.read_to_end(&mut Vec::new())).await;
+    Client::of(&fixture).await.infer(packed(&request(RANDOM, 1))).await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_only_model_need_not_be_named() {
     let fixture = start(&[("cpn", checkpoint(MethodKind::Cpn, 1))]).await;

@@ -57,12 +57,14 @@ pub(super) fn metadata(core: &PlannerCore) -> Vec<u8> {
 /// `INVALID_ARGUMENT` with the field that is missing, unknown, twice there, or not what it should be.
 pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> Result<PlanRequest, Error> {
     let mut fields = numpy::read(payload)?;
+    // What Python calls None is not there.
+    fields.retain(|_, value| !value.is_nil());
     if let Some(name) = fields.keys().find(|name| !FIELDS.contains(&name.as_str())) {
         return Err(Error::invalid("payload", format!("fields among {}", FIELDS.join(", ")), name));
     }
     match fields.remove(PROMPT) {
         None => (),
-        Some(prompt) if prompt.as_str() == Some("") => (),
+        Some(prompt) if text(prompt.clone()).is_ok_and(|prompt| prompt.is_empty()) => (),
         Some(prompt) => {
             return Err(Error::invalid(PROMPT, "none: the goal is a picture or a position", brief(&prompt)));
         }
@@ -116,10 +118,15 @@ fn position(value: Value) -> Result<Position, Error> {
 }
 
 fn text(value: Value) -> Result<String, Error> {
-    value.as_str().map(str::to_owned).ok_or_else(|| Error::invalid("", "text", brief(&value)))
+    match numpy::scalar(value) {
+        Value::Binary(bytes) => String::from_utf8(bytes)
+            .map_err(|error| Error::invalid("", "text", format!("{} bytes", error.as_bytes().len()))),
+        value => value.as_str().map(str::to_owned).ok_or_else(|| Error::invalid("", "text", brief(&value))),
+    }
 }
 
 fn seed(value: Value) -> Result<u64, Error> {
+    let value = numpy::scalar(value);
     value.as_u64().ok_or_else(|| Error::invalid("", "an integer from 0 to 2^64 - 1", brief(&value)))
 }
 

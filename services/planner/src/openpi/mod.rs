@@ -9,7 +9,7 @@ mod numpy;
 use crate::core::PlannerCore;
 use futures::{SinkExt, StreamExt};
 pub use message::request;
-use service_kit::access::{Access, Refusal};
+use service_kit::access::{Access, Peer, Refusal};
 use service_kit::listener::{Connection, ListenConfig, Listener};
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -17,14 +17,15 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
-use tokio_tungstenite::tungstenite::error::CapacityError;
-use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
-use tokio_tungstenite::tungstenite::http::StatusCode;
-use tokio_tungstenite::tungstenite::http::header::AUTHORIZATION;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
+use tokio_tungstenite::tungstenite::handshake::machine::TryParse;
+use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, create_response, write_response};
+use tokio_tungstenite::tungstenite::http::header::{AUTHORIZATION, CONNECTION, CONTENT_LENGTH, CONTENT_TYPE};
+use tokio_tungstenite::tungstenite::http::{HeaderValue, StatusCode};
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocketConfig};
+use tokio_tungstenite::tungstenite::protocol::{CloseFrame, Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Bytes, Error as SocketError, Message};
-use tokio_tungstenite::{WebSocketStream, accept_hdr_async_with_config};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 use tracing::debug;
@@ -37,6 +38,10 @@ const MAX_CONNECTIONS: usize = 64;
 pub(crate) const MAX_WAITING: usize = 2 * MAX_CONNECTIONS;
 /// Largest request.
 const MAX_BYTES: usize = 1 << 20;
+/// Longest head of a request for a connection.
+const MAX_HEAD_BYTES: usize = 16 << 10;
+/// Path at which openpi's server says that it is well.
+const HEALTH: &str = "/healthz";
 /// What a connection buffers, one way; a picture is 21 kB.
 const BUFFER_BYTES: usize = 32 << 10;
 /// How long a client may say nothing before it is asked for a sign of life, and then again before it is given up.
@@ -47,6 +52,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const LINGER: Duration = Duration::from_secs(1);
 
 type Socket = WebSocketStream<Connection>;
+/// With a text, if it is not the beginning of a WebSocket.
+type Answer = ErrorResponse;
 
 /// The planner's place among servers of openpi.
 #[derive(Debug)]
@@ -108,7 +115,8 @@ async fn serve(
     place: Option<OwnedSemaphorePermit>,
     stop: &CancellationToken,
 ) -> Result<(), SocketError> {
-    let mut socket = timeout(PATIENCE, shake_hands(stream, access, place.is_some())).await.map_err(too_slow)??;
+    let shaken = timeout(PATIENCE, shake_hands(stream, access, place.is_some())).await.map_err(too_slow)??;
+    let Some(mut socket) = shaken else { return Ok(()) };
     send(&mut socket, Message::binary(message::metadata(core))).await?;
     let mut asked = false;
     while let Some(received) = stop.run_until_cancelled(timeout(SILENCE, socket.next())).await {
@@ -136,33 +144,70 @@ async fn serve(
     hang_up(socket, CloseCode::Away).await
 }
 
-#[expect(clippy::result_large_err, reason = "the library's signature")]
-async fn shake_hands(stream: Connection, access: &Access, has_place: bool) -> Result<Socket, SocketError> {
-    let (peer, access) = (stream.peer().clone(), access.clone());
-    let admit = move |request: &Request, response: Response| {
-        let authorization = request.headers().get(AUTHORIZATION).and_then(|value| value.to_str().ok());
-        if let Err(refusal) = access.check(&peer, authorization, "openpi", may_plan) {
-            let forbidden = refusal == Refusal::Forbidden;
-            let status = if forbidden { StatusCode::FORBIDDEN } else { StatusCode::UNAUTHORIZED };
-            return Err(refused(status, &refusal.to_string()));
-        }
-        if !has_place {
-            let reason = format!("connections: expected a free place, got {MAX_CONNECTIONS}");
-            return Err(refused(StatusCode::SERVICE_UNAVAILABLE, &reason));
-        }
-        Ok(response)
+/// Upgrades a connection to a WebSocket. Who asks for health instead, as of openpi's server, is told of it, and who asks for anything
+/// else is refused; neither gets a socket.
+async fn shake_hands(mut stream: Connection, access: &Access, has_place: bool) -> Result<Option<Socket>, SocketError> {
+    let (request, rest) = read_request(&mut stream).await?;
+    let answer = if request.uri().path() == HEALTH {
+        told(StatusCode::OK, "OK")
+    } else {
+        admit(&request, access, stream.peer(), has_place).unwrap_or_else(|refusal| refusal)
     };
+    let mut bytes = Vec::new();
+    write_response(&mut bytes, &answer)?;
+    bytes.extend(answer.body().iter().flat_map(|text| text.bytes()));
+    stream.write_all(&bytes).await?;
+    if answer.status() != StatusCode::SWITCHING_PROTOCOLS {
+        stream.shutdown().await?;
+        return Ok(None);
+    }
+
     let config = WebSocketConfig::default()
         .read_buffer_size(BUFFER_BYTES)
         .write_buffer_size(BUFFER_BYTES)
         .max_message_size(Some(MAX_BYTES))
         .max_frame_size(Some(MAX_BYTES));
-    accept_hdr_async_with_config(stream, admit, Some(config)).await
+    Ok(Some(WebSocketStream::from_partially_read(stream, rest, Role::Server, Some(config)).await))
 }
 
-fn refused(status: StatusCode, reason: &str) -> ErrorResponse {
-    let mut response = ErrorResponse::new(Some(format!("{reason}\n")));
+/// The head of a GET request, and what came with it.
+async fn read_request(stream: &mut Connection) -> Result<(Request, Vec<u8>), SocketError> {
+    let mut head = Vec::new();
+    loop {
+        if let Some((size, request)) = Request::try_parse(&head)? {
+            return Ok((request, head.split_off(size)));
+        }
+        if head.len() > MAX_HEAD_BYTES || stream.read_buf(&mut head).await? == 0 {
+            return Err(SocketError::Protocol(ProtocolError::HandshakeIncomplete));
+        }
+    }
+}
+
+/// The answer to who asks for a WebSocket.
+#[expect(clippy::result_large_err, reason = "both are answers")]
+fn admit(request: &Request, access: &Access, peer: &Peer, has_place: bool) -> Result<Answer, Answer> {
+    let response = create_response(request).map_err(|error| told(StatusCode::BAD_REQUEST, &error.to_string()))?;
+    let authorization = request.headers().get(AUTHORIZATION).and_then(|value| value.to_str().ok());
+    if let Err(refusal) = access.check(peer, authorization, "openpi", may_plan) {
+        let forbidden = refusal == Refusal::Forbidden;
+        let status = if forbidden { StatusCode::FORBIDDEN } else { StatusCode::UNAUTHORIZED };
+        return Err(told(status, &refusal.to_string()));
+    }
+    if !has_place {
+        let reason = format!("connections: expected a free place, got {MAX_CONNECTIONS}");
+        return Err(told(StatusCode::SERVICE_UNAVAILABLE, &reason));
+    }
+    Ok(response.map(|()| None))
+}
+
+fn told(status: StatusCode, text: &str) -> Answer {
+    let text = format!("{text}\n");
+    let mut response = Answer::new(None);
     *response.status_mut() = status;
+    response.headers_mut().insert(CONTENT_LENGTH, text.len().into());
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("text/plain; charset=utf-8"));
+    response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
+    *response.body_mut() = Some(text);
     response
 }
 

@@ -51,6 +51,47 @@ impl TryFrom<Value> for Array {
     }
 }
 
+/// A number or text for what numpy packs as a map: a scalar of its own types, or an array without dimensions. Anything else stays as
+/// it is.
+pub(super) fn scalar(value: Value) -> Value {
+    let Value::Map(pairs) = &value else { return value };
+    let of_name = |name: &[u8]| pairs.iter().find(|(key, _)| key.as_slice() == Some(name)).map(|(_, value)| value);
+    let is = |name: &[u8]| of_name(name).and_then(Value::as_bool) == Some(true);
+    let packed = match of_name(b"data") {
+        Some(data) if is(b"__npgeneric__") => Some(data.clone()),
+        Some(Value::Binary(data)) if is(b"__ndarray__") && of_name(b"shape") == Some(&Value::Array(Vec::new())) => {
+            of_name(b"dtype").and_then(Value::as_str).and_then(|dtype| element(dtype, data))
+        }
+        _ => None,
+    };
+    packed.unwrap_or(value)
+}
+
+/// The one element of an array without dimensions: an integer, bytes, or text of four bytes a letter.
+fn element(dtype: &str, data: &[u8]) -> Option<Value> {
+    let wide = |fill: u8| {
+        let mut bytes = [fill; 8];
+        bytes.get_mut(..data.len())?.copy_from_slice(data);
+        Some(bytes)
+    };
+    let sign = if data.last().is_some_and(|byte| *byte >= 0x80) { 0xff } else { 0 };
+    match dtype.as_bytes() {
+        [b'<' | b'|', b'u', ..] => Some(u64::from_le_bytes(wide(0)?).into()),
+        [b'<' | b'|', b'i', ..] => Some(i64::from_le_bytes(wide(sign)?).into()),
+        [b'|', b'S', ..] => {
+            let end = data.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+            Some(Value::Binary(data[..end].to_vec()))
+        }
+        [b'<', b'U', ..] => {
+            let (letters, []) = data.as_chunks() else { return None };
+            let letters = letters.iter().map(|letter| char::from_u32(u32::from_le_bytes(*letter)));
+            let text: String = letters.collect::<Option<_>>()?;
+            Some(text.trim_end_matches('\0').into())
+        }
+        _ => None,
+    }
+}
+
 /// What came, for an error: of what may be long, only how long it is.
 pub(super) fn brief(value: &Value) -> String {
     match value {
