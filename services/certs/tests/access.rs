@@ -13,13 +13,17 @@ use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
 use zenoh::query::QueryTarget;
 use zenoh::{Session, Wait};
 
-/// Time for what is allowed to arrive, and for what is denied not to.
-const SETTLED: Duration = Duration::from_millis(500);
+/// Time for what is denied not to arrive.
+const SETTLED: Duration = Duration::from_millis(300);
+/// Time for what is allowed to arrive.
+const PATIENCE: Duration = Duration::from_secs(60);
 /// Time that a query has.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
+type Pairs = BTreeSet<(Role, Role)>;
+
 /// Pairs of roles, of which the second may use what the first offers. A router passes on everything.
-fn expected(endpoint: &Endpoint) -> BTreeSet<(Role, Role)> {
+fn expected(endpoint: &Endpoint) -> Pairs {
     let may = |roles: &[Role], role| role == Role::Router || roles.contains(&role);
     let pairs = Role::ALL.into_iter().flat_map(|offering| Role::ALL.map(|using| (offering, using)));
     pairs.filter(|(offering, using)| may(endpoint.offered_by, *offering) && may(endpoint.used_by, *using)).collect()
@@ -31,30 +35,32 @@ fn key_of(endpoint: &Endpoint, role: Role) -> String {
 }
 
 /// Pairs of roles, of which the second gets an answer of the first.
-async fn answered(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+async fn answered(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let mut queryables = Vec::new();
     for (role, session) in sessions {
         let key = key_of(endpoint, *role);
         let queryable = session.declare_queryable(key.clone()).complete(true);
         queryables.push(queryable.callback(move |query| query.reply(&key, "yes").wait().unwrap()).await.unwrap());
     }
-    tokio::time::sleep(SETTLED).await;
-    let asked = sessions.iter().flat_map(|(using, session)| {
-        Role::ALL.map(|offering| async move {
-            let key = key_of(endpoint, offering);
-            let replies = session.get(key).target(QueryTarget::All).timeout(TIMEOUT).await.unwrap();
-            let mut answered = false;
-            while let Ok(reply) = replies.recv_async().await {
-                answered |= reply.result().is_ok();
-            }
-            answered.then_some((offering, *using))
-        })
-    });
-    join_all(asked).await.into_iter().flatten().collect()
+    until(expected, async || {
+        let asked = sessions.iter().flat_map(|(using, session)| {
+            Role::ALL.map(|offering| async move {
+                let key = key_of(endpoint, offering);
+                let replies = session.get(key).target(QueryTarget::All).timeout(TIMEOUT).await.unwrap();
+                let mut answered = false;
+                while let Ok(reply) = replies.recv_async().await {
+                    answered |= reply.result().is_ok();
+                }
+                answered.then_some((offering, *using))
+            })
+        });
+        join_all(asked).await.into_iter().flatten().collect()
+    })
+    .await
 }
 
 /// Pairs of roles, of which the second hears what the first publishes.
-async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let heard = Arc::new(Mutex::new(BTreeSet::new()));
     let mut subscribers = Vec::new();
     for (using, session) in sessions {
@@ -65,31 +71,47 @@ async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTree
         });
         subscribers.push(subscriber.await.unwrap());
     }
-    tokio::time::sleep(SETTLED).await;
-    for (offering, session) in sessions {
-        session.put(key_of(endpoint, *offering), offering.name()).await.unwrap();
-    }
-    tokio::time::sleep(SETTLED).await;
-    heard.lock().unwrap().clone()
+    until(expected, async || {
+        for (offering, session) in sessions {
+            session.put(key_of(endpoint, *offering), offering.name()).await.unwrap();
+        }
+        tokio::time::sleep(SETTLED).await;
+        heard.lock().unwrap().clone()
+    })
+    .await
 }
 
 /// Pairs of roles, of which the second sees the token of the first.
-async fn seen(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>) -> BTreeSet<(Role, Role)> {
+async fn seen(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let mut tokens = Vec::new();
     for (role, session) in sessions {
         tokens.push(session.liveliness().declare_token(key_of(endpoint, *role)).await.unwrap());
     }
-    tokio::time::sleep(SETTLED).await;
-    let mut seen = BTreeSet::new();
-    for (using, session) in sessions {
-        let found = session.liveliness().get(endpoint.key().unwrap()).timeout(TIMEOUT).await.unwrap();
-        while let Ok(reply) = found.recv_async().await {
-            let Ok(sample) = reply.into_result() else { continue };
-            let offering = sample.key_expr().rsplit_once('/').unwrap().1.parse().unwrap();
-            seen.insert((offering, *using));
+    until(expected, async || {
+        let mut seen = Pairs::new();
+        for (using, session) in sessions {
+            let found = session.liveliness().get(endpoint.key().unwrap()).timeout(TIMEOUT).await.unwrap();
+            while let Ok(reply) = found.recv_async().await {
+                let Ok(sample) = reply.into_result() else { continue };
+                let offering = sample.key_expr().rsplit_once('/').unwrap().1.parse().unwrap();
+                seen.insert((offering, *using));
+            }
         }
-    }
-    seen
+        seen
+    })
+    .await
+}
+
+/// Looks again until everything that is expected is there, then once more for what is not to be: declarations take their time.
+async fn until(expected: &Pairs, look: impl AsyncFn() -> Pairs) -> Pairs {
+    let all = async {
+        while !look().await.is_superset(expected) {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    let _ = tokio::time::timeout(PATIENCE, all).await;
+    tokio::time::sleep(SETTLED).await;
+    look().await
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -101,14 +123,14 @@ async fn each_role_does_what_it_may_and_nothing_else() {
     }
     for endpoint in ENDPOINTS {
         let mut expected = expected(endpoint);
-        let found = match endpoint.kind {
-            Kind::Query => answered(endpoint, &sessions).await,
-            Kind::Publication => heard(endpoint, &sessions).await,
-            Kind::Liveliness => seen(endpoint, &sessions).await,
-        };
         // A session reaches itself without the router.
         expected.retain(|(offering, using)| offering != using);
-        let found: BTreeSet<_> = found.into_iter().filter(|(offering, using)| offering != using).collect();
+        let found = match endpoint.kind {
+            Kind::Query => answered(endpoint, &sessions, &expected).await,
+            Kind::Publication => heard(endpoint, &sessions, &expected).await,
+            Kind::Liveliness => seen(endpoint, &sessions, &expected).await,
+        };
+        let found: Pairs = found.into_iter().filter(|(offering, using)| offering != using).collect();
         let denied: Vec<_> = expected.difference(&found).collect();
         let allowed: Vec<_> = found.difference(&expected).collect();
         let key = endpoint.key().unwrap();

@@ -141,13 +141,13 @@ async fn zenohs_own_file_and_passwords_are_heeded() {
     let zenoh_config = Some(write("router.json5", &file));
     let _router =
         service_kit::session::open(&SessionConfig { zenoh_config, ..SessionConfig::default() }).await.unwrap();
-    let joins = async |password: &str| {
+    let joins = async |password: &str, within: Duration| {
         let password_file = Some(write("password", password));
         let config = SessionConfig { user: Some("robot".into()), password_file, ..client(&endpoint) };
-        tokio::time::timeout(TIMEOUT, service_kit::session::open(&config)).await.is_ok()
+        tokio::time::timeout(within, service_kit::session::open(&config)).await.is_ok()
     };
-    assert!(joins("secret\n").await);
-    assert!(!joins("guessed").await);
+    assert!(joins("secret\n", common::PATIENCE).await);
+    assert!(!joins("guessed", TIMEOUT).await);
 
     // What is given wins over the file; what the file lacks is zenoh's default, which listens everywhere.
     let file = write("peer.json5", "{ scouting: { multicast: { enabled: false } } }");

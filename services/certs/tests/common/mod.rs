@@ -8,6 +8,7 @@ use service_kit::session::Mode;
 use std::collections::BTreeSet;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
+use std::sync::Once;
 use tempfile::TempDir;
 use zenoh::Session;
 
@@ -20,6 +21,12 @@ pub struct Network {
 
 impl Network {
     pub async fn start() -> Self {
+        // As the programs do: zenoh's TLS links are safe on one thread only.
+        static RUNTIME: Once = Once::new();
+        #[expect(unsafe_code, reason = "set before zenoh reads it, and once")]
+        RUNTIME.call_once(|| unsafe {
+            std::env::set_var("ZENOH_RUNTIME", "(rx: (worker_threads: 1), tx: (handover: rx))");
+        });
         let folder = tempfile::tempdir().unwrap();
         authority(folder.path()).init(&BTreeSet::new(), BTreeSet::new()).unwrap();
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
