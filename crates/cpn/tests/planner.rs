@@ -290,7 +290,9 @@ fn a_search_in_pieces_is_that_in_one() {
                         left -= 1;
                         left > 0
                     });
-                    planner.plan(&queries[1..], &mut fixed(Solver::Hybrid(3), 1));
+                    if times % 2 == 0 {
+                        planner.plan(&queries[1..], &mut fixed(Solver::Hybrid(3), 1));
+                    }
                     times += 1;
                 }
                 assert!(pieces > 2 || times > 2, "{solver:?}: {times} times of {pieces} pieces");

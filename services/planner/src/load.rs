@@ -14,7 +14,7 @@ const WEIGHT: f64 = 0.1;
 /// What is promised is a little longer than what is expected.
 const CAUTION: f64 = 1.5;
 /// Searches that take longer are done in pieces, between which others are planned for.
-const LONG: Duration = Duration::from_millis(5);
+const LONG: Duration = Duration::from_millis(10);
 /// How long a search in pieces keeps the model, at most, before it is looked at what waits.
 pub(crate) const SLICE: Duration = Duration::from_millis(2);
 /// Plans in a generation, if a request does not say.

@@ -21,7 +21,7 @@ use wire::planner::{ModelInfo, StageTimes};
 use wire::{Code, Error};
 
 /// What plans that a request's search makes longer may take together, so that others need not wait for long.
-const BATCH: Duration = Duration::from_millis(20);
+const BATCH: Duration = Duration::from_millis(30);
 
 /// The thread's side.
 pub(crate) struct Owner {

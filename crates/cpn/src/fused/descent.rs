@@ -3,10 +3,13 @@
 use super::inner::{Actions, Purpose};
 use super::planner::{Dynamics, Worker};
 use crate::method::{Plan, Query};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// A descent for R plans, at most [`BLOCK`](super::planner::BLOCK). It can be left after any update and taken up again.
 #[derive(Debug)]
 pub(crate) struct Descent {
+    /// What it is told apart by.
+    id: u64,
     pub(crate) plans: Vec<Plan>,
     /// Updates that were made.
     pub(crate) done: usize,
@@ -28,7 +31,7 @@ impl Descent {
             let inner_losses = if dynamics.plans { vec![loss] } else { Vec::new() };
             Plan { actions: worker.plan(dynamics, rows, r), inner_losses, iterations: 0 }
         };
-        Self { plans: losses.into_iter().enumerate().map(begun).collect(), done: 0, left: None }
+        Self { id: new_id(), plans: losses.into_iter().enumerate().map(begun).collect(), done: 0, left: None }
     }
 
     /// Makes one update, for a method that plans; whether it is the `last`, as far as is known, and whether the best plan
@@ -45,7 +48,8 @@ impl Descent {
             self.done += 1;
             return;
         }
-        if let Some(left) = self.left.take() {
+        let left = self.left.take().filter(|_| worker.resident != Some(self.id));
+        if let Some(left) = left {
             // The gradient needs what the rollout of these actions left in memory; it comes out the same again.
             for (r, plan) in left.iter().enumerate() {
                 worker.set_plan(dynamics, rows, r, plan);
@@ -69,16 +73,26 @@ impl Descent {
 
     /// Takes what the next update needs out of the worker's memory.
     pub(super) fn leave(&mut self, worker: &mut Worker<f32>, dynamics: &Dynamics<f32>) {
-        let rows = self.plans.len();
-        // What was left already is not in the memory.
-        self.left.get_or_insert_with(|| (0..rows).map(|r| worker.plan(dynamics, rows, r)).collect());
+        // What was left already may not be in the memory any more.
+        if self.left.is_none() {
+            let rows = self.plans.len();
+            self.left = Some((0..rows).map(|r| worker.plan(dynamics, rows, r)).collect());
+            worker.resident = Some(self.id);
+        }
     }
 
     /// Leaves out a plan of a descent that was left.
     pub(crate) fn remove(&mut self, r: usize) {
         self.plans.remove(r);
+        // The rollout in memory is one of all.
+        self.id = new_id();
         self.left.as_mut().map(|left| left.remove(r));
     }
+}
+
+fn new_id() -> u64 {
+    static IDS: AtomicU64 = AtomicU64::new(0);
+    IDS.fetch_add(1, Ordering::Relaxed)
 }
 
 fn ends<'a>(queries: &'a [Query<'_>]) -> impl Iterator<Item = (&'a [f32], &'a [f32])> {

@@ -51,6 +51,8 @@ pub(super) struct Worker<T: Real> {
     pub(super) x_g: Vec<T>,
     /// By step, then row, `[H, R, A]`.
     pub(super) actions: Vec<T>,
+    /// The descent whose last rollout this is.
+    pub(super) resident: Option<u64>,
 }
 
 impl Planner {
@@ -87,6 +89,7 @@ impl<T: Real> Worker<T> {
             x: zeros(sizes.latent),
             x_g: zeros(sizes.latent),
             actions: zeros(dynamics.horizon * sizes.actions),
+            resident: None,
         }
     }
 
@@ -100,7 +103,8 @@ impl<T: Real> Worker<T> {
         ends: impl Iterator<Item = (&'a [T], &'a [T])>,
     ) -> impl Iterator<Item = T> {
         let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
-        let Self { rollout, buffers, x, x_g, actions, .. } = self;
+        let Self { rollout, buffers, x, x_g, actions, resident, .. } = self;
+        *resident = None;
         let mut rows = 0;
         for (from, to) in ends {
             x[rows * latent..][..latent].copy_from_slice(from);
@@ -139,6 +143,7 @@ impl Worker<f32> {
 
     /// Writes a plan, `[H][A]`, as row r of R = `rows`.
     pub(super) fn set_plan(&mut self, dynamics: &Dynamics<f32>, rows: usize, r: usize, plan: &[Vec<f32>]) {
+        self.resident = None;
         for (t, action) in plan.iter().enumerate() {
             self.action(dynamics, rows, (t, r)).copy_from_slice(action);
         }
