@@ -142,7 +142,7 @@ fn a_render_spec_is_json_or_nothing() {
 #[test]
 fn a_refusal_shows_no_bytes_of_a_file() {
     let secret = b"-----BEGIN PRIVATE KEY-----\nMIGHAgEAMBMGByqGSM49AgEGCCqGSM49AwEHBG0wawIBAQQg";
-    let mut short = vec![0; 8];
+    let mut short = [0; 8];
     short[0] = 10;
     for bytes in [&secret[..], &[&short[..], &b"secret"[..]].concat(), &[&short[..], &b"{\"secret\":"[..]].concat()] {
         let message = checkpoint::from_bytes(bytes).unwrap_err().to_string();

@@ -297,7 +297,11 @@ fn a_search_in_pieces_is_that_in_one() {
                 }
                 assert!(pieces > 2 || times > 2, "{solver:?}: {times} times of {pieces} pieces");
                 assert_eq!(ongoing.rollouts(), method::rollouts(solver, 5), "{solver:?}");
-                assert_eq!(ongoing.into_plans(), [whole.clone()], "{solver:?} in {pieces} pieces, {threads} threads");
+                assert_eq!(
+                    ongoing.into_plans(),
+                    std::slice::from_ref(&whole),
+                    "{solver:?} in {pieces} pieces, {threads} threads"
+                );
             }
         }
     }
