@@ -6,7 +6,7 @@ use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
-use crate::task::{Answer, PlanTask, Reply};
+use crate::task::{Answer, PlanTask};
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -80,12 +80,12 @@ impl PlannerCore {
         self.thread.plan(self.task(request)?).await
     }
 
-    /// The same for who awaits nothing: `reply` is called with the answer, at once or on the model's thread, which it must not
-    /// hold up. Whoever calls keeps the deadline of a plan that is being made.
+    /// The same for who awaits nothing: `reply` is called with the answer, on a thread that it may block. Whoever calls keeps the
+    /// deadline of a plan that is being made.
     pub(crate) fn plan_then(&self, request: PlanRequest, reply: impl FnOnce(Answer) + Send + 'static) {
         match self.task(request) {
-            Ok(task) => self.thread.enqueue(task, Reply::Called(Box::new(reply))),
-            Err(error) => reply(Err(error)),
+            Ok(task) => self.thread.enqueue_then(task, Box::new(reply)),
+            Err(error) => self.thread.call(Box::new(reply), error),
         }
     }
 
@@ -277,4 +277,84 @@ fn check_size(field: &str, image: &Image) -> Result<(), Error> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "tests")]
+mod tests {
+    use super::*;
+    use std::sync::{Mutex, mpsc};
+    use std::time::Duration;
+    use wire::Position;
+
+    const PATIENCE: Duration = Duration::from_secs(60);
+
+    fn request() -> PlanRequest {
+        let position = Position::new([0.0; 3]).unwrap();
+        PlanRequest::new(RANDOM, Goal::Position(position), position.into())
+    }
+
+    /// Answers that are not read hold up nobody but those whom they are for, however many they are.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn answers_that_block_hold_up_nobody_else() {
+        let models_dir = tempfile::TempDir::new().unwrap();
+        let config = Config { models_dir: models_dir.path().into(), ..Config::default() };
+        let core = PlannerCore::start(&config).await.unwrap();
+        let (sender, entered) = mpsc::channel();
+        let (release, released) = mpsc::channel::<()>();
+        let released = Arc::new(Mutex::new(released));
+        let unread = || {
+            let (sender, released) = (sender.clone(), Arc::clone(&released));
+            move |answer: Answer| {
+                answer.unwrap();
+                sender.send(()).unwrap();
+                // Until it is released, or the test ends.
+                let _ = released.lock().unwrap().recv();
+            }
+        };
+        let entered = Arc::new(Mutex::new(entered));
+        let has_entered = || {
+            let entered = Arc::clone(&entered);
+            tokio::task::spawn_blocking(move || entered.lock().unwrap().recv_timeout(PATIENCE).unwrap())
+        };
+        for round in 0..20 {
+            core.plan_then(request(), unread());
+            has_entered().await.unwrap();
+            let planned = tokio::time::timeout(PATIENCE, core.plan(request())).await;
+            planned.unwrap_or_else(|_| panic!("plan {round} waits for an answer to another client")).unwrap();
+            let swapped = tokio::time::timeout(
+                PATIENCE,
+                core.serve(Model::new(
+                    ModelInfo { name: "other".into(), ..Model::random().info },
+                    String::new(),
+                    Model::random().method,
+                )),
+            );
+            swapped.await.unwrap_or_else(|_| panic!("swap {round} waits for an answer to a client")).unwrap();
+        }
+        // One after the other returns; plans go on as before.
+        for _ in 0..20 {
+            release.send(()).unwrap();
+            core.plan(request()).await.unwrap();
+        }
+        tokio::time::timeout(PATIENCE, core.stop()).await.unwrap();
+        assert_eq!(core.plan(request()).await.unwrap_err().code, Code::Unavailable);
+    }
+
+    /// A planner can be stopped while an answer is not read.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn an_answer_that_blocks_does_not_hold_up_shutdown() {
+        let models_dir = tempfile::TempDir::new().unwrap();
+        let config = Config { models_dir: models_dir.path().into(), ..Config::default() };
+        let core = PlannerCore::start(&config).await.unwrap();
+        let (sender, entered) = mpsc::channel();
+        let (release, released) = mpsc::channel::<()>();
+        core.plan_then(request(), move |_| {
+            sender.send(()).unwrap();
+            let _ = released.recv();
+        });
+        tokio::task::spawn_blocking(move || entered.recv_timeout(PATIENCE).unwrap()).await.unwrap();
+        tokio::time::timeout(PATIENCE, core.stop()).await.unwrap();
+        drop(release);
+    }
 }

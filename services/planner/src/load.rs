@@ -38,6 +38,11 @@ pub(crate) struct Load {
     /// By the name of the model.
     costs: Mutex<HashMap<String, Costs>>,
     given_up: AtomicBool,
+    /// Number of the answer that the models' thread is sending itself; 0 while it sends none.
+    replying: AtomicU64,
+    replies: AtomicU64,
+    /// Threads that were sending one when another took over.
+    stuck: AtomicUsize,
 }
 
 /// What the plans of a model cost, by kind of work. A rollout is as long as the model's horizon.
@@ -128,7 +133,7 @@ impl Costs {
 impl Load {
     /// A task has been accepted.
     pub(crate) fn begin(&self, estimate: Estimate) {
-        self.tasks.fetch_add(1, Ordering::Relaxed);
+        self.tasks.fetch_add(1, Ordering::SeqCst);
         self.of(estimate).fetch_add(nanoseconds(estimate), Ordering::Relaxed);
         self.searches.fetch_add(usize::from(estimate.long), Ordering::Relaxed);
         gauge!(QUEUE_DEPTH).increment(1);
@@ -148,7 +153,47 @@ impl Load {
 
     /// Tasks that are not answered yet.
     pub(crate) fn tasks(&self) -> usize {
-        self.tasks.load(Ordering::Relaxed)
+        self.tasks.load(Ordering::SeqCst)
+    }
+
+    /// The models' thread is about to send an answer itself, if nobody waits; none if somebody does.
+    pub(crate) fn begin_reply(&self) -> Option<u64> {
+        let reply = self.replies.fetch_add(1, Ordering::Relaxed) + 1;
+        // Who comes now sees it, or is seen.
+        self.replying.store(reply, Ordering::SeqCst);
+        if self.tasks() == 0 {
+            return Some(reply);
+        }
+        self.replying.store(0, Ordering::SeqCst);
+        None
+    }
+
+    /// The answer is sent; false if another thread has taken over in the meantime.
+    pub(crate) fn end_reply(&self, reply: u64) -> bool {
+        let leads = self.replying.compare_exchange(reply, 0, Ordering::SeqCst, Ordering::SeqCst).is_ok();
+        if !leads {
+            self.stuck.fetch_sub(1, Ordering::SeqCst);
+        }
+        leads
+    }
+
+    /// The answer that is being sent.
+    pub(crate) fn replying(&self) -> Option<u64> {
+        Some(self.replying.load(Ordering::SeqCst)).filter(|reply| *reply != 0)
+    }
+
+    /// Whether another thread may take over, as this answer is still being sent.
+    pub(crate) fn take_over(&self, reply: u64) -> bool {
+        let stuck = self.replying.compare_exchange(reply, 0, Ordering::SeqCst, Ordering::SeqCst).is_ok();
+        if stuck {
+            self.stuck.fetch_add(1, Ordering::SeqCst);
+        }
+        stuck
+    }
+
+    /// Whether an answer that was taken over from is still being sent.
+    pub(crate) fn has_stuck(&self) -> bool {
+        self.stuck.load(Ordering::SeqCst) > 0
     }
 
     /// What a task would take by itself.

@@ -4,17 +4,21 @@
 use crate::config::Config;
 use crate::load::{Estimate, Load};
 use crate::model::Model;
-use crate::owner::Owner;
+use crate::owner::{Owner, Step};
 use crate::task::{Answer, PlanTask, Reply, Waiting, queue_full, stopped, too_late, too_long, too_many};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::mpsc::{self, SendError};
-use std::time::Instant;
-use std::{io, thread};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use std::{fmt, io, thread};
+use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
-use tracing::debug_span;
+use tracing::{debug_span, warn};
 use wire::Error;
 use wire::planner::ModelInfo;
+
+/// How long an answer may take to send before another thread takes over the models.
+const PATIENCE: Duration = Duration::from_millis(2);
 
 /// The caller's side of the thread.
 #[derive(Debug, Clone)]
@@ -26,7 +30,16 @@ pub(crate) struct ModelThread {
     /// The same for searches that are done in pieces, until they are answered: half as many.
     searches: Arc<Semaphore>,
     load: Arc<Load>,
+    lead: Arc<Mutex<Option<Lead>>>,
+    threads: u16,
+    runtime: Handle,
     models: watch::Receiver<BTreeMap<String, ModelInfo>>,
+}
+
+/// What the thread has that owns the models.
+struct Lead {
+    owner: Owner,
+    jobs: mpsc::Receiver<Job>,
 }
 
 /// What the thread is asked to do.
@@ -39,7 +52,7 @@ pub(crate) enum Job {
 }
 
 impl ModelThread {
-    /// Starts the thread with these models.
+    /// Starts the thread with these models, within a runtime of tokio.
     ///
     /// # Errors
     /// If the system gives no thread.
@@ -48,15 +61,47 @@ impl ModelThread {
         let infos = models.iter().map(|model| (model.info.name.clone(), model.info.clone())).collect();
         let (published, subscribed) = watch::channel(infos);
         let load = Arc::new(Load::default());
-        let threads = config.threads.get();
-        let (config, known) = (config.clone(), Arc::clone(&load));
+        let owner = Owner::new(config, models, published, Arc::clone(&load));
         let capacity = config.queue_capacity.get();
+        let [places, searches] = [capacity, capacity.div_ceil(2)].map(|count| Arc::new(Semaphore::new(count.into())));
+        let lead = Arc::new(Mutex::new(Some(Lead { owner, jobs: receiver })));
+        let (threads, runtime) = (config.threads.get(), Handle::current());
+        let started =
+            Self { jobs: sender, places, capacity, searches, load, lead, threads, runtime, models: subscribed };
+        started.spawn(|_| true)?;
+        Ok(started)
+    }
+
+    /// Starts a thread that owns the models, if `takes_over` says so there.
+    fn spawn(&self, takes_over: impl FnOnce(&Load) -> bool + Send + 'static) -> io::Result<()> {
+        let (lead, load, threads) = (Arc::clone(&self.lead), Arc::clone(&self.load), self.threads);
         thread::Builder::new().name("model".into()).spawn(move || {
             tch::set_num_threads(threads.into());
-            Owner::new(&config, models, published, known).run(&receiver);
+            if takes_over(&load) {
+                work(&lead, &load);
+            }
         })?;
-        let [places, searches] = [capacity, capacity.div_ceil(2)].map(|count| Arc::new(Semaphore::new(count.into())));
-        Ok(Self { jobs: sender, places, capacity, searches, load, models: subscribed })
+        Ok(())
+    }
+
+    /// Sees to it that somebody who waits does not wait for an answer to another to be sent.
+    fn watch(&self) {
+        let Some(reply) = self.load.replying() else { return };
+        let this = self.clone();
+        self.runtime.spawn(async move {
+            tokio::time::sleep(PATIENCE).await;
+            this.take_over(reply);
+        });
+    }
+
+    /// Lets another thread own the models, if this answer is still being sent.
+    fn take_over(&self, reply: u64) {
+        if self.load.replying() != Some(reply) {
+            return;
+        }
+        if let Err(error) = self.spawn(move |load| load.take_over(reply)) {
+            warn!(%error, "an answer is not read; those who wait do so until it is given up");
+        }
     }
 
     /// Waits in the queue and plans.
@@ -89,7 +134,30 @@ impl ModelThread {
         let queued = debug_span!(parent: &task.span, "queue");
         let job = Job::Plan(Waiting { task, enqueued, queued, place, reply, estimate });
         if let Err(SendError(Job::Plan(Waiting { reply, .. }))) = self.jobs.send(job) {
-            reply.send(Err(stopped()));
+            return reply.send(Err(stopped()));
+        }
+        self.watch();
+    }
+
+    /// The same for what is called with the answer, and may block.
+    pub(crate) fn enqueue_then(&self, task: PlanTask, call: Box<dyn FnOnce(Answer) + Send>) {
+        self.enqueue(task, Reply::Called(call, self.runtime.clone()));
+    }
+
+    /// Calls it with an error at once.
+    pub(crate) fn call(&self, call: Box<dyn FnOnce(Answer) + Send>, error: Error) {
+        Reply::Called(call, self.runtime.clone()).send(Err(error));
+    }
+
+    /// Has a job done that is no plan.
+    async fn ask(&self, job: Job, mut done: oneshot::Receiver<Result<(), Error>>) -> Result<(), Error> {
+        self.jobs.send(job).map_err(|_| stopped())?;
+        loop {
+            let before = self.load.replying();
+            match tokio::time::timeout(PATIENCE, &mut done).await {
+                Ok(answer) => return answer.map_err(|_| stopped())?,
+                Err(_) => before.into_iter().for_each(|reply| self.take_over(reply)),
+            }
         }
     }
 
@@ -120,8 +188,7 @@ impl ModelThread {
     /// If its name is new and one too many, or the thread has stopped.
     pub(crate) async fn serve(&self, model: Model) -> Result<(), Error> {
         let (reply, done) = oneshot::channel();
-        self.jobs.send(Job::Serve { model, reply }).map_err(|_| stopped())?;
-        done.await.map_err(|_| stopped())?
+        self.ask(Job::Serve { model, reply }, done).await
     }
 
     /// Serves a model no longer, with all its checkpoints.
@@ -130,8 +197,7 @@ impl ModelThread {
     /// If there is none of that name, or the thread has stopped.
     pub(crate) async fn unload(&self, model: String) -> Result<(), Error> {
         let (reply, done) = oneshot::channel();
-        self.jobs.send(Job::Unload { model, reply }).map_err(|_| stopped())?;
-        done.await.map_err(|_| stopped())?
+        self.ask(Job::Unload { model, reply }, done).await
     }
 
     /// The models being served, by name.
@@ -149,7 +215,45 @@ impl ModelThread {
         // The thread has ended when its side of the channel is gone, which it may be already.
         let mut models = self.models.clone();
         if self.jobs.send(Job::Stop).is_ok() {
-            while models.changed().await.is_ok() {}
+            loop {
+                let before = self.load.replying();
+                match tokio::time::timeout(PATIENCE, models.changed()).await {
+                    Ok(Ok(())) => {}
+                    Ok(Err(_)) => return,
+                    Err(_) => before.into_iter().for_each(|reply| self.take_over(reply)),
+                }
+            }
         }
+    }
+}
+
+/// Owns the models until there is nothing more to do, or another thread has taken over. An answer after which nobody waits is sent
+/// from here: another thread would have to be woken. Who comes while that blocks, because its client does not read, has another
+/// thread take over the models.
+fn work(lead: &Mutex<Option<Lead>>, load: &Load) {
+    let lock = || lead.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut owned = lock();
+    while let Some(Lead { owner, jobs }) = owned.as_mut() {
+        match owner.step(jobs) {
+            Step::Next => {}
+            Step::End => *owned = None,
+            Step::Reply(reply, answer) => match load.begin_reply() {
+                None => reply.send(answer),
+                Some(number) => {
+                    drop(owned);
+                    reply.send_here(answer);
+                    if !load.end_reply(number) {
+                        return;
+                    }
+                    owned = lock();
+                }
+            },
+        }
+    }
+}
+
+impl fmt::Debug for Lead {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Lead")
     }
 }

@@ -1,4 +1,4 @@
-//! The one thread that owns every model. What waits is planned together, as far as it can be.
+//! What one thread at a time owns: every model. What waits is planned together, as far as it can be.
 
 use crate::config::Config;
 use crate::load::{Load, SLICE, resolve};
@@ -6,7 +6,7 @@ use crate::model::Model;
 use crate::model_thread::Job;
 use crate::searches::Searches;
 use crate::served::Served;
-use crate::task::{Accepted, Answer, PlanTask, Waiting, too_late};
+use crate::task::{Accepted, Answer, PlanTask, Reply, Waiting, too_late};
 use cpn::method::{Query, rollouts};
 use lru::LruCache;
 use metrics::{counter, histogram};
@@ -35,6 +35,18 @@ pub(crate) struct Owner {
     load: Arc<Load>,
     batch_size: usize,
     batch_delay: Duration,
+    /// The answer after which nobody waits.
+    last: Option<(Reply, Answer)>,
+}
+
+/// What is to be done next.
+pub(crate) enum Step {
+    /// Another step.
+    Next,
+    /// To answer, while nobody waits, and then another step.
+    Reply(Reply, Answer),
+    /// Nothing, ever.
+    End,
 }
 
 impl Owner {
@@ -58,36 +70,36 @@ impl Owner {
             load,
             batch_size: config.batch_size.get().into(),
             batch_delay: Duration::from_millis(config.batch_delay_ms.into()),
+            last: None,
         }
     }
 
-    /// Works until it is told to stop, or nobody is left to tell it anything. A search that takes long is gone on with between
-    /// other jobs, for as long as these take, or while there are none.
-    pub(crate) fn run(mut self, jobs: &mpsc::Receiver<Job>) {
-        loop {
-            let next = || if self.searches.is_empty() { jobs.recv().ok() } else { jobs.try_recv().ok() };
-            let job = self.queue.pop_front().or_else(next);
-            let (started, idle) = (Instant::now(), job.is_none());
-            match job {
-                Some(Job::Plan(first)) => {
-                    let batch = self.gather(first, jobs);
-                    self.answer(batch);
-                }
-                Some(Job::Serve { model, reply }) => drop(reply.send(self.serve(model))),
-                Some(Job::Unload { model, reply }) => drop(reply.send(self.unload(&model))),
-                None if self.searches.is_empty() => return,
-                Some(Job::Stop) => {
-                    while !self.searches.is_empty() {
-                        self.go_on(SLICE);
-                    }
-                    return;
-                }
-                None => {}
+    /// Does the next job. A search that takes long is gone on with between other jobs, for as long as these take, or while there
+    /// are none.
+    pub(crate) fn step(&mut self, jobs: &mpsc::Receiver<Job>) -> Step {
+        let next = || if self.searches.is_empty() { jobs.recv().ok() } else { jobs.try_recv().ok() };
+        let job = self.queue.pop_front().or_else(next);
+        let (started, idle) = (Instant::now(), job.is_none());
+        match job {
+            Some(Job::Plan(first)) => {
+                let batch = self.gather(first, jobs);
+                self.answer(batch);
             }
-            if !self.searches.is_empty() {
-                self.go_on(if idle { SLICE } else { started.elapsed().min(SLICE) });
+            Some(Job::Serve { model, reply }) => drop(reply.send(self.serve(model))),
+            Some(Job::Unload { model, reply }) => drop(reply.send(self.unload(&model))),
+            None if self.searches.is_empty() => return Step::End,
+            Some(Job::Stop) => {
+                while !self.searches.is_empty() {
+                    self.go_on(SLICE);
+                }
+                return Step::End;
             }
+            None => {}
         }
+        if !self.searches.is_empty() {
+            self.go_on(if idle { SLICE } else { started.elapsed().min(SLICE) });
+        }
+        self.last.take().map_or(Step::Next, |(reply, answer)| Step::Reply(reply, answer))
     }
 
     fn serve(&mut self, model: Model) -> Result<(), Error> {
@@ -149,7 +161,7 @@ impl Owner {
     fn together(&mut self, first: &Waiting) -> usize {
         let PlanTask { model, model_digest, .. } = &first.task;
         match self.models.get(model, model_digest.as_deref()) {
-            Ok(model) if first.estimate.long => model.borrow().method.together(),
+            Ok(model) if first.estimate.long => model.model().method.together(),
             _ => usize::MAX,
         }
     }
@@ -205,16 +217,20 @@ impl Owner {
         }
     }
 
-    fn reply(&self, Accepted { reply, estimate, .. }: Accepted, answer: Answer) {
+    fn reply(&mut self, Accepted { reply, estimate, .. }: Accepted, answer: Answer) {
         self.load.end(estimate);
         if let Ok(response) = &answer {
             observe(response.times);
         }
-        reply.send(answer);
+        if self.last.is_none() && self.load.tasks() == 0 && !self.load.has_stuck() {
+            self.last = Some((reply, answer));
+        } else {
+            reply.send(answer);
+        }
     }
 
     fn check(&mut self, task: &PlanTask) -> Result<(), Error> {
-        self.models.get(&task.model, task.model_digest.as_deref())?.borrow().check(task)
+        self.models.get(&task.model, task.model_digest.as_deref())?.model().check(task)
     }
 
     /// Runs what answers tasks, one by one; a panic is everybody's error.
@@ -228,7 +244,7 @@ impl Owner {
         let Self { models, embeddings, load, .. } = self;
         let PlanTask { model: name, model_digest, search, .. } = tasks[0];
         let shared = models.get(name, model_digest.as_deref()).expect("checked");
-        let mut model = shared.borrow_mut();
+        let mut model = shared.model();
         let started = Instant::now();
         let ends = encode(&mut model, embeddings, tasks);
         let encoded = started.elapsed();
@@ -260,7 +276,7 @@ impl Owner {
         let tasks: Vec<_> = accepted.iter().map(|accepted| &accepted.task).collect();
         let PlanTask { model: name, model_digest, .. } = tasks[0];
         let model = models.get(name, model_digest.as_deref()).expect("checked");
-        let ends = catch_unwind(AssertUnwindSafe(|| encode(&mut model.borrow_mut(), embeddings, &tasks)));
+        let ends = catch_unwind(AssertUnwindSafe(|| encode(&mut model.model(), embeddings, &tasks)));
         let encoded = started.elapsed();
         match ends {
             Ok(ends) => {

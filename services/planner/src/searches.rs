@@ -53,7 +53,7 @@ impl Searches {
         encoded: Duration,
     ) {
         let spans = tasks.iter().map(|accepted| debug_span!(parent: &accepted.task.span, "search")).collect();
-        let (model, ongoing) = (Shared::clone(model), model.borrow().begin(tasks[0].task.search));
+        let (model, ongoing) = (model.clone(), model.model().begin(tasks[0].task.search));
         self.waiting.push_back(Searching { tasks, ends, model, ongoing, encoded, searched: Duration::ZERO, spans });
     }
 
@@ -143,7 +143,7 @@ impl Searching {
 
     fn resume(&mut self, go_on: &mut dyn FnMut() -> bool) {
         let queries = queries(&self.tasks, &self.ends);
-        self.model.borrow_mut().method.resume(&queries, &mut self.ongoing, go_on);
+        self.model.model().method.resume(&queries, &mut self.ongoing, go_on);
     }
 
     fn finish(self) -> Vec<(Accepted, Answer)> {
@@ -155,7 +155,7 @@ impl Searching {
                 encode_seconds: encoded.as_secs_f64(),
                 plan_seconds: searched.as_secs_f64(),
             };
-            model.borrow().response(&accepted.task, plan, &query, times)
+            model.model().response(&accepted.task, plan, &query, times)
         });
         let answers: Vec<_> = answers.collect();
         tasks.into_iter().zip(answers).collect()

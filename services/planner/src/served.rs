@@ -2,10 +2,9 @@
 
 use crate::model::Model;
 use lru::LruCache;
-use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
-use std::rc::Rc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use wire::planner::ModelInfo;
 use wire::{Code, Error};
 
@@ -17,7 +16,19 @@ pub(crate) struct Served {
 }
 
 /// A model that searches may go on with after it is gone from here.
-pub(crate) type Shared = Rc<RefCell<Model>>;
+#[derive(Debug, Clone)]
+pub(crate) struct Shared(Arc<Mutex<Model>>);
+
+impl Shared {
+    fn new(model: Model) -> Self {
+        Self(Arc::new(Mutex::new(model)))
+    }
+
+    /// Whoever has the models has it at once.
+    pub(crate) fn model(&self) -> MutexGuard<'_, Model> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
 
 /// A model's checkpoints.
 struct Checkpoints {
@@ -52,7 +63,7 @@ impl Served {
             }
             None => LruCache::new(self.retired_capacity),
         };
-        self.by_name.insert(name, Checkpoints { digest, current: Rc::new(RefCell::new(model)), retired });
+        self.by_name.insert(name, Checkpoints { digest, current: Shared::new(model), retired });
         Ok(())
     }
 
@@ -78,9 +89,9 @@ impl Served {
             Some(digest) if digest != served => {
                 let kept = format!("{served}, which is served, or one of {} kept before", retired.len());
                 let kept = |got| Error::new(Code::FailedPrecondition, "model_digest", kept, got);
-                retired.get(digest).map(Rc::clone).ok_or_else(|| kept(digest))
+                retired.get(digest).cloned().ok_or_else(|| kept(digest))
             }
-            _ => Ok(Rc::clone(current)),
+            _ => Ok(current.clone()),
         }
     }
 }

@@ -4,6 +4,7 @@ use crate::load::Estimate;
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 use tracing::Span;
 use wire::planner::{PlanResponse, Search, Solver};
@@ -59,8 +60,8 @@ pub(crate) type Answer = Result<PlanResponse, Error>;
 pub(crate) enum Reply {
     /// To who awaits it, or has given up.
     Awaited(oneshot::Sender<Answer>),
-    /// To what is called with it, on the model's thread, and must not hold that up.
-    Called(Box<dyn FnOnce(Answer) + Send>),
+    /// To what is called with it and may block, on a thread of this runtime that may.
+    Called(Box<dyn FnOnce(Answer) + Send>, Handle),
 }
 
 impl PlanTask {
@@ -112,11 +113,19 @@ impl Reply {
         matches!(self, Self::Awaited(sender) if sender.is_closed())
     }
 
-    /// Hands the answer over.
+    /// Hands the answer over, and does not block.
     pub(crate) fn send(self, answer: Answer) {
         match self {
             Self::Awaited(sender) => drop(sender.send(answer)),
-            Self::Called(call) => call(answer),
+            Self::Called(call, runtime) => drop(runtime.spawn_blocking(move || call(answer))),
+        }
+    }
+
+    /// The same without another thread: what is called may block this one.
+    pub(crate) fn send_here(self, answer: Answer) {
+        match self {
+            Self::Called(call, _) => call(answer),
+            awaited => awaited.send(answer),
         }
     }
 }

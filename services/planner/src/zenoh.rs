@@ -16,6 +16,7 @@ use tracing::{Instrument, Span, debug_span, warn};
 use wire::planner::{ListModelsRequest, PlanRequest};
 use wire::{Error, Message, key, query, trace};
 use zenoh::Session;
+use zenoh::bytes::ZBytes;
 use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::liveliness::LivelinessToken;
@@ -50,6 +51,7 @@ impl ZenohServer {
             core: core.clone(),
             // More than can wait for the model, so that what clients see is the core's own limit.
             places: Arc::new(Semaphore::new(2 * usize::from(capacity))),
+            plans: Arc::new(Semaphore::new(2 * usize::from(capacity))),
             capacity,
             tasks: TaskTracker::new(),
             runtime: Handle::current(),
@@ -133,34 +135,43 @@ struct Requests {
     session: Session,
     core: PlannerCore,
     places: Arc<Semaphore>,
+    /// The same for plans, until their answers are sent.
+    plans: Arc<Semaphore>,
     capacity: u16,
     tasks: TaskTracker,
     runtime: Handle,
 }
 
 impl Requests {
-    /// Declares the queryable of plans. Zenoh's callback puts a request into the model's queue and the model's thread sends the
-    /// answer: a client that is alone would wait for every thread that had to be woken in between.
+    /// Declares the queryable of plans. Zenoh's callback puts a request into the model's queue and, if nobody else waits, the
+    /// model's thread sends the answer: a client that is alone would wait for every thread that had to be woken in between. All
+    /// else is sent by threads that may block, as zenoh does for clients that do not read.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
         let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
+        let (places, capacity) = (Arc::clone(&self.plans), self.capacity);
         let own = Arc::new(key.clone());
-        let callback = move |query: Query| {
+        let callback = move |mut query: Query| {
             let own = Arc::clone(&own);
-            let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
+            let place = Arc::clone(&places).try_acquire_owned().map_err(|_| queue_full(capacity));
+            let span = request_span(&query);
+            let request = place.as_ref().map_err(Clone::clone).and_then(|_| query::request::<PlanRequest>(&query));
+            // What waits to be sent may be much, and needs it no longer.
+            query.payload_mut().into_iter().for_each(|payload| *payload = ZBytes::new());
             let deadline = request.as_ref().ok().and_then(|request| request.deadline);
             // The model's thread and the clock both want to answer; the first does.
-            let waiting = Arc::new(Mutex::new(Some((query, tasks.token()))));
+            let waiting = Arc::new(Mutex::new(Some((query, tasks.token(), place))));
             let answer = move |plan: Answer| {
                 let waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner).take();
-                if let Some((query, _in_flight)) = waiting {
+                if let Some((query, _in_flight, _place)) = waiting {
                     reply(&query, &own, plan);
                 }
             };
             let clock = deadline.map(|deadline| {
                 let answer = answer.clone();
+                let blocking = runtime.clone();
                 AbortOnDropHandle::new(runtime.spawn(async move {
                     tokio::time::sleep(deadline).await;
-                    answer(Err(too_late(deadline)));
+                    blocking.spawn_blocking(move || answer(Err(too_late(deadline))));
                 }))
             });
             let planned = move |plan| {
@@ -169,7 +180,7 @@ impl Requests {
             };
             match request {
                 Ok(request) => span.in_scope(|| core.plan_then(request, planned)),
-                Err(error) => planned(Err(error)),
+                Err(error) => drop(runtime.spawn_blocking(move || planned(Err(error)))),
             }
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
@@ -184,7 +195,7 @@ impl Requests {
     ) -> anyhow::Result<Queryable<()>>
     where
         Q: Message + Send,
-        R: Message + Send,
+        R: Message + Send + 'static,
         F: Future<Output = Result<R, Error>> + Send,
         S: Fn(PlannerCore, Q) -> F + Copy + Send + Sync + 'static,
     {
@@ -204,7 +215,8 @@ impl Requests {
                 if let (Some(change), Err(error)) = (change, &result) {
                     CHANGES.refused(change, query.key_expr(), error);
                 }
-                reply(&query, &own, result);
+                let sending = tokio::task::spawn_blocking(move || reply(&query, &own, result));
+                drop(sending.await);
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
