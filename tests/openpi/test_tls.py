@@ -46,7 +46,7 @@ def secure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecurePlanner]:
     files, models = tmp_path_factory.mktemp("certificates"), tmp_path_factory.mktemp("models")
     certs = [CERTS, "--dir", str(files)]
     subprocess.run([*certs, "init"], check=True)
-    token = subprocess.run([*certs, "token", "client.openpi"], check=True, capture_output=True, text=True).stdout.strip()
+    token = subprocess.check_output([*certs, "token", "client.openpi"], text=True).strip()
     own = files / "planner"
     options = ["--models-dir", str(models), "--grpc-listen", "127.0.0.1:0", "--openpi-listen", "127.0.0.1:0"]
     options += ["--tls-ca", str(own / "ca.pem"), "--tls-certificate", str(own / "certificate.pem")]
