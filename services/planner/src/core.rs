@@ -8,6 +8,7 @@ use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask};
 use anyhow::{Context, ensure};
+use service_kit::files;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
@@ -231,7 +232,7 @@ impl PlannerCore {
 /// `random` and every checkpoint in `folder`.
 fn load_all(folder: &Path, signatures: &Signatures, computing: Computing) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
-    for path in checkpoints(folder).with_context(|| format!("model folder {}", folder.display()))? {
+    for path in checkpoints(folder)? {
         let loaded = load_file(folder, &path, signatures, computing);
         models.push(loaded.with_context(|| format!("checkpoint {}", path.display()))?);
     }
@@ -241,15 +242,13 @@ fn load_all(folder: &Path, signatures: &Signatures, computing: Computing) -> any
     Ok(models)
 }
 
-/// The checkpoint files of a folder, ordered by name; none if there is no folder.
-fn checkpoints(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
-    let entries = match folder.read_dir() {
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries?,
-    };
-    let paths = entries.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
-    let mut paths: Vec<_> = paths.into_iter().filter(|path| path.extension().is_some_and(|e| e == EXTENSION)).collect();
-    paths.sort();
+/// The checkpoint files of a folder, ordered by name. Only the folder that nobody named, the default, need not be there.
+fn checkpoints(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    if folder == Config::default().models_dir && !folder.try_exists().context("models_dir")? {
+        return Ok(Vec::new());
+    }
+    let mut paths = files::list(folder).context("models_dir")?;
+    paths.retain(|path| path.extension().is_some_and(|e| e == EXTENSION));
     Ok(paths)
 }
 

@@ -99,10 +99,25 @@ async fn a_faulty_checkpoint_prevents_the_start() {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_checkpoints_the_random_model_is_served() {
     let models_dir = TempDir::new().unwrap();
-    let absent = Config { models_dir: models_dir.path().join("absent"), ..config(&models_dir) };
-    let planner = planner::start(absent).await.unwrap();
+    let planner = planner::start(config(&models_dir)).await.unwrap();
     let models = planner.core().list_models().models;
     assert_eq!(models.iter().map(|info| info.name.as_str()).collect::<Vec<_>>(), [RANDOM]);
+    planner.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_folder_that_was_named_must_be_there_and_files_that_come_along_are_nobodys() {
+    let models_dir = TempDir::new().unwrap();
+    let absent = Config { models_dir: models_dir.path().join("absent"), ..config(&models_dir) };
+    let error = format!("{:#}", planner::start(absent).await.unwrap_err());
+    assert!(error.contains("models_dir: folder ") && error.contains("absent"), "{error}");
+
+    for stray in ["._cpn.safetensors", ".cpn.safetensors.lock"] {
+        std::fs::write(models_dir.path().join(stray), "no checkpoint").unwrap();
+    }
+    std::fs::create_dir(models_dir.path().join("lost+found")).unwrap();
+    let planner = planner::start(config(&models_dir)).await.unwrap();
+    assert_eq!(planner.core().list_models().models.len(), 1);
     planner.shutdown().await.unwrap();
 }
 

@@ -50,7 +50,9 @@ async fn spans_follow_a_request_from_its_client() {
 
     let (zenoh, grpc) = (format!("tcp/{}", free()), free());
     let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-planner"));
-    command.args(["--models-dir", "no-such-folder", "--listen", &zenoh, "--grpc-listen", &grpc, "--name", "traced"]);
+    let models = tempfile::tempdir().unwrap();
+    command.arg("--models-dir").arg(models.path());
+    command.args(["--listen", &zenoh, "--grpc-listen", &grpc, "--name", "traced"]);
     command.env("OTEL_EXPORTER_OTLP_ENDPOINT", collector).env("OTEL_BSP_SCHEDULE_DELAY", "100");
     let _process = Process(command.spawn().unwrap());
     let config = SessionConfig { connect: vec![zenoh], ..SessionConfig::default() };

@@ -41,9 +41,11 @@ async fn start_planner(folder: &Path, name: &str, endpoint: &str) -> planner::Pl
 }
 
 fn planner_config(folder: &Path, name: &str, endpoint: &str) -> planner::Config {
+    let models_dir = folder.join("none");
+    std::fs::create_dir_all(&models_dir).unwrap();
     planner::Config {
         name: name.into(),
-        models_dir: folder.join("none"),
+        models_dir,
         grpc_listen: "127.0.0.1:0".parse().unwrap(),
         session: SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() },
         ..planner::Config::default()

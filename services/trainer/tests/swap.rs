@@ -52,6 +52,7 @@ async fn swap(swaps: u32, endpoint: &str) {
         ..service::Config::default()
     });
     let trainer = trainer.await.unwrap();
+    std::fs::create_dir(folder.path().join("none")).unwrap();
     let planner = planner::start(planner::Config {
         name: PLANNER.into(),
         models_dir: folder.path().join("none"),
