@@ -1,5 +1,5 @@
-//! What every service needs around its work: configuration, files, logs, metrics, shutdown, a zenoh session, and listeners
-//! with TLS and access control for gRPC and others.
+//! What every service needs around its work: configuration, files, logs, metrics, output, shutdown, a zenoh session, and
+//! listeners with TLS and access control for gRPC and others.
 
 pub mod access;
 pub mod changes;
@@ -8,6 +8,7 @@ pub mod files;
 pub mod grpc;
 pub mod listener;
 pub mod metrics;
+pub mod output;
 pub mod process;
 pub mod session;
 pub mod shutdown;

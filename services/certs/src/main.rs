@@ -3,6 +3,7 @@
 use certs::Authority;
 use clap::{Args, Parser, Subcommand};
 use comfy_table::{LineStyle, Table, presets};
+use service_kit::output;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use time::OffsetDateTime;
@@ -86,10 +87,7 @@ fn main() -> anyhow::Result<()> {
             authority.revoke_tokens(&identity)?;
             authority.revoke(&identity)
         }
-        Command::Token { identity } => {
-            println!("{}", authority.issue_token(&identity)?);
-            Ok(())
-        }
+        Command::Token { identity } => output::print_line(authority.issue_token(&identity)?),
         Command::List => list(&authority),
     }
 }
@@ -113,6 +111,5 @@ fn list(authority: &Authority) -> anyhow::Result<()> {
         let hosts: Vec<_> = identity.hosts.iter().map(String::as_str).collect();
         table.add_row([name.as_str(), &identity.not_after.format(&Rfc3339)?, state, &hosts.join(", ")]);
     }
-    println!("{table}");
-    Ok(())
+    output::print_line(table)
 }

@@ -2,6 +2,7 @@
 
 use anyhow::Context;
 use evaluator::{Cli, Command, Summary};
+use service_kit::output;
 use std::process::ExitCode;
 
 fn main() -> anyhow::Result<ExitCode> {
@@ -15,7 +16,7 @@ async fn program() -> anyhow::Result<ExitCode> {
         Command::Report(args) => tell(&evaluator::report(&args.out)?, args.json),
         Command::Replay(args) => {
             let replay = evaluator::replay(&args).await?;
-            println!("{replay}");
+            output::print_line(&replay)?;
             Ok(if replay.difference.is_none() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
         }
     }
@@ -23,9 +24,9 @@ async fn program() -> anyhow::Result<ExitCode> {
 
 fn tell(summary: &Summary, json: bool) -> anyhow::Result<ExitCode> {
     if json {
-        println!("{}", serde_json::to_string_pretty(summary).context("printing the summary")?);
+        output::print_line(serde_json::to_string_pretty(summary).context("printing the summary")?)?;
     } else {
-        println!("{}", evaluator::table(summary));
+        output::print_line(evaluator::table(summary))?;
     }
     let errors = summary.errors();
     if errors > 0 {

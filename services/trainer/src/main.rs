@@ -13,7 +13,7 @@ use cpn::Preset;
 use serde::Deserialize;
 use serde::de::{IntoDeserializer, value};
 use service_kit::session::SessionConfig;
-use service_kit::{config, session, shutdown, telemetry};
+use service_kit::{config, output, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use trainer::config::Config;
@@ -44,8 +44,7 @@ async fn program() -> anyhow::Result<()> {
                 None => true,
             };
             let outcome = if enough { train(config, arguments.json).await? } else { Outcome::Interrupted { step: 0 } };
-            tell_outcome(&outcome, arguments.json);
-            Ok(())
+            tell_outcome(&outcome, arguments.json)
         }
         Command::Preset(arguments) => print_preset(&arguments),
         Command::Start(arguments) => start(arguments).await,
@@ -104,21 +103,17 @@ async fn train(config: Config, json: bool) -> anyhow::Result<Outcome> {
     }
 }
 
-fn tell_outcome(outcome: &Outcome, json: bool) {
-    if json {
-        // Nobody may be left to read it.
-        let _ = print_line(outcome);
-    }
+fn tell_outcome(outcome: &Outcome, json: bool) -> anyhow::Result<()> {
     match outcome {
         Outcome::Finished { digest } => tracing::info!(digest, "checkpoint written"),
         Outcome::Interrupted { step } => tracing::info!(step, "interrupted; the same command goes on from here"),
     }
+    if json { output::accept(print_line(outcome)) } else { Ok(()) }
 }
 
 fn print_preset(PresetArgs { name }: &PresetArgs) -> anyhow::Result<()> {
     let preset = Preset::deserialize(name.as_str().into_deserializer()).map_err(|e: value::Error| anyhow!(e))?;
-    print!("{}", toml::to_string(&Config::from(preset))?);
-    Ok(())
+    output::print(toml::to_string(&Config::from(preset))?)
 }
 
 async fn start(arguments: StartArgs) -> anyhow::Result<()> {
@@ -145,7 +140,7 @@ async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: Runs
     let session = session::open(&session).await?;
     let runs = client::list(&session, &trainer).await?;
     if json {
-        println!("{}", serde_json::to_string_pretty(&runs)?);
+        output::print_line(serde_json::to_string_pretty(&runs)?)?;
     } else {
         let mut table = Table::new();
         table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
@@ -156,7 +151,7 @@ async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: Runs
             let (step, steps) = (of(|p| p.step.to_string()), of(|p| p.steps.to_string()));
             table.add_row([name, state.name(), &step, &steps, &of(|p| format!("{:.4}", p.loss))]);
         }
-        println!("{table}");
+        output::print_line(table)?;
     }
     session.close().await.map_err(|e| anyhow!(e))
 }
@@ -167,8 +162,7 @@ async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
     if let RunState::Failed { reason } = &run.state {
         bail!("{} failed: {reason}", run.name);
     }
-    println!("{} is {}", run.name, run.state.name());
-    Ok(())
+    output::print_line(format_args!("{} is {}", run.name, run.state.name()))
 }
 
 async fn replay(ReplayArgs { dataset, tasks, session }: ReplayArgs) -> anyhow::Result<()> {
@@ -197,9 +191,9 @@ async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Re
 fn verify(VerifyArgs { dataset, tasks, episodes, json }: &VerifyArgs) -> anyhow::Result<()> {
     let report = verify::run(dataset, *tasks, *episodes)?;
     if *json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        output::print_line(serde_json::to_string_pretty(&report)?)?;
     } else {
-        print!("{report}");
+        output::print(&report)?;
     }
     ensure!(report.faults.is_empty(), "{}: {} faults", dataset.display(), report.faults.len());
     Ok(())
@@ -209,9 +203,9 @@ async fn versions(VersionsArgs { model, json, session }: VersionsArgs) -> anyhow
     let session = session::open(&session).await?;
     let versions = publish::list(&session, model).await?;
     if json {
-        println!("{}", serde_json::to_string_pretty(&versions)?);
+        output::print_line(serde_json::to_string_pretty(&versions)?)?;
     } else {
-        println!("{}", publish::table(&versions));
+        output::print_line(publish::table(&versions))?;
     }
     session.close().await.map_err(|e| anyhow!(e))
 }
@@ -219,13 +213,13 @@ async fn versions(VersionsArgs { model, json, session }: VersionsArgs) -> anyhow
 async fn promote(PromoteArgs { model, version, session }: PromoteArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
     let promoted = publish::promote(&session, model, version).await?;
-    println!("{} {} is promoted", promoted.model, promoted.version);
+    output::print_line(format_args!("{} {} is promoted", promoted.model, promoted.version))?;
     session.close().await.map_err(|e| anyhow!(e))
 }
 
 async fn rollback(RollbackArgs { model, session }: RollbackArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
     let promoted = publish::roll_back(&session, model).await?;
-    println!("{} {} is promoted", promoted.model, promoted.version);
+    output::print_line(format_args!("{} {} is promoted", promoted.model, promoted.version))?;
     session.close().await.map_err(|e| anyhow!(e))
 }

@@ -94,7 +94,7 @@ impl Observer for Bar {
     }
 }
 
-/// Progress as lines of JSON on standard output, a few each second. When nobody reads them any more, the run ends.
+/// Progress as lines of JSON on standard output, a few each second. When they cannot be written any more, the run ends.
 #[derive(Debug, Default)]
 pub struct JsonLines {
     printed: Option<Instant>,
