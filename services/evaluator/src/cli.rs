@@ -1,6 +1,6 @@
 //! The command line.
 
-use crate::record::GoalSource;
+use crate::record::{FIRST_EVALUATION_SEED, GoalSource};
 use clap::{Args, Parser, Subcommand, value_parser};
 use service_kit::SessionConfig;
 use std::path::PathBuf;
@@ -43,8 +43,9 @@ pub struct RunArgs {
     /// Variations of each task.
     #[arg(long, default_value_t = 20, value_parser = value_parser!(u32).range(1..=100_000))]
     pub trials: u32,
-    /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations.
-    #[arg(long, default_value_t = 1_000_000, value_parser = value_parser!(u64).range(..1 << 47))]
+    /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations, and the report
+    /// says so.
+    #[arg(long, default_value_t = FIRST_EVALUATION_SEED, value_parser = value_parser!(u64).range(..1 << 47))]
     pub first_seed: u64,
     /// Whose end the goal picture shows. Another variation's is an ablation, and the report says so.
     #[arg(long, value_enum, default_value_t = GoalSource::SameVariation)]

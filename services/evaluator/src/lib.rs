@@ -31,6 +31,7 @@ pub use table::table;
 
 use anyhow::{Context, bail, ensure};
 use link::Link;
+use record::FIRST_EVALUATION_SEED;
 use service_kit::session::Connection;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -44,13 +45,18 @@ use zenoh::Session;
 /// Runs what is missing of an evaluation, and reports.
 ///
 /// # Errors
-/// If router, planners and workers do not come up, the planners differ, a model or task is unknown, the folder cannot be used, or the user
-/// interrupts. A trial that fails for reasons of its own is no error here: the summary counts it.
+/// If router, planners and workers do not come up, the planners differ, a model or task is unknown or they do not fit, the
+/// folder cannot be used or another run has it, or the user interrupts. A trial that fails for reasons of its own is no error here: the summary counts it.
 pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     for (option, names) in [("--planner", &args.planner), ("--models", &args.models), ("--tasks", &args.tasks)] {
+        ensure!(names.iter().all(|name| !name.is_empty()), "{option}: expected names, got {:?}", names.join(","));
         let distinct: BTreeSet<_> = names.iter().collect();
         ensure!(distinct.len() == names.len(), "{option}: expected every name once, got {}", names.join(","));
     }
+    let folder = Folder::new(&args.out);
+    let _keeper = folder.take_over()?;
+    folder.check_goal(args.goal)?;
+
     let patience = Duration::from_secs(args.wait_secs);
     let timeout = Duration::from_secs(args.timeout_secs);
     let start = Instant::now();
@@ -71,12 +77,19 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
         first_seed: args.first_seed,
         goal: args.goal,
     };
-    let folder = Folder::new(&args.out);
-    folder.check_goal(args.goal)?;
-    folder.write_run(&run)?;
+    if run.has_demonstration_seeds() {
+        tracing::warn!(
+            "--first-seed: seeds below {FIRST_EVALUATION_SEED} are those of demonstrations, which models may have been \
+             trained on; the report says so"
+        );
+    }
     let recovery = Duration::from_secs(args.recovery_secs);
     let link = Link { session: session.clone(), timeout, recovery, alive };
-    schedule::Schedule::new(Arc::new(run), folder, link)?.drive(patience).await?;
+    let run = Arc::new(run);
+    let schedule = schedule::Schedule::new(run.clone(), folder.clone(), link)?;
+    schedule.check().await?;
+    folder.write_run(&run)?;
+    schedule.drive(patience).await?;
     // What is reported is in the folder by now.
     if let Err(error) = session.close().await {
         tracing::warn!("closing the zenoh session: {error}");

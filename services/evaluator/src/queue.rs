@@ -73,6 +73,11 @@ impl Queue {
         self.tasks.iter().map(|task| task.jobs.len()).sum()
     }
 
+    /// The first variation that waits of each task.
+    pub(crate) fn first_variations(&self) -> Vec<Variation> {
+        self.tasks.iter().filter_map(|task| task.jobs.front()).map(|job| job.variation.clone()).collect()
+    }
+
     /// The next trial: of the task the worker is at, or else of the task with the most left.
     pub(crate) fn next(&mut self, current: Option<&str>) -> Option<Job> {
         let left = |&task: &usize| self.tasks[task].jobs.len();

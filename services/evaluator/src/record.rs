@@ -4,15 +4,17 @@ use anyhow::{Context, ensure};
 use recording::plans::{self, Plans};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
-use service_kit::files::write_atomically;
+use service_kit::files::{self, write_atomically};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
-use std::io::ErrorKind;
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use wire::planner::ModelInfo;
 
 /// Version of the files; another one is refused.
 pub const FORMAT: u32 = 2;
+
+/// Seeds below this one are those of demonstrations.
+pub(crate) const FIRST_EVALUATION_SEED: u64 = 1_000_000;
 
 /// What was compared, and how.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,6 +40,13 @@ pub struct Run {
     pub first_seed: u64,
     /// Where the goals come from.
     pub goal: GoalSource,
+}
+
+impl Run {
+    /// Whether its variations are, at least in part, those that demonstrations show.
+    pub fn has_demonstration_seeds(&self) -> bool {
+        self.first_seed < FIRST_EVALUATION_SEED
+    }
 }
 
 /// A list, or a single name in place of one.
@@ -158,6 +167,12 @@ pub struct Folder {
 }
 
 impl Folder {
+    /// Makes the folder, if there is none, and takes it over for as long as the answer lives: what a run reports is what is
+    /// in it.
+    pub(crate) fn take_over(&self) -> anyhow::Result<File> {
+        files::take_over(&self.root).context("--out")
+    }
+
     /// The folder at a path, which need not exist.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
@@ -191,7 +206,7 @@ impl Folder {
     /// Reads what the run is.
     pub(crate) fn read_run(&self) -> anyhow::Result<Run> {
         let path = self.path("run.json");
-        let run: Run = read_json(&path)?;
+        let run: Run = read_json(&path).context("remove the file if it is damaged; `run` writes it anew")?;
         ensure!(run.format == FORMAT, "{}: expected format {FORMAT}, got {}", path.display(), run.format);
         Ok(run)
     }
@@ -222,7 +237,8 @@ impl Folder {
     }
 
     /// The run's trials that the folder holds: of its models with their present digests, at most `run.trials` seeds of
-    /// each task. Ordered by task, seed and model.
+    /// each task. Ordered by task, seed and model. Records that are damaged, or of another trial than where they lie, are left
+    /// out, each with a line in the log; `run` writes them anew.
     ///
     /// # Errors
     /// If a file cannot be read, or is of another format.
@@ -234,10 +250,7 @@ impl Folder {
             for model in &run.models {
                 let seeds = self.seeds(task, &model.name)?;
                 for seed in seeds.range(run.first_seed..).filter(|seed| !skipped.contains(seed)) {
-                    let path = self.trial_path(task, &model.name, *seed);
-                    let trial: Trial = read_json(&path)?;
-                    let format = trial.format;
-                    ensure!(format == FORMAT, "{}: expected format {FORMAT}, got {format}", path.display());
+                    let Some(trial) = self.read_trial(task, &model.name, *seed)? else { continue };
                     if trial.model_digest == model.digest && trial.goal == run.goal {
                         by_seed.entry(*seed).or_default().push(trial);
                     }
@@ -246,6 +259,34 @@ impl Folder {
             selected.extend(by_seed.into_values().take(run.trials as usize).flatten());
         }
         Ok(selected)
+    }
+
+    /// The trial of a place; none if the record is damaged, or says that it is of another.
+    fn read_trial(&self, task: &str, model: &str, seed: u64) -> anyhow::Result<Option<Trial>> {
+        #[derive(Deserialize)]
+        struct Header {
+            format: u32,
+        }
+        let path = self.trial_path(task, model, seed);
+        let bytes = fs::read(&path).with_context(|| format!("reading {}", path.display()))?;
+        let left_out = |reason: String| {
+            tracing::warn!("{}: {reason}; left out until the trial is run again", path.display());
+            Ok(None)
+        };
+
+        if let Ok(Header { format }) = serde_json::from_slice(&bytes) {
+            ensure!(format == FORMAT, "{}: expected format {FORMAT}, got {format}", path.display());
+        }
+        let trial: Trial = match serde_json::from_slice(&bytes) {
+            Ok(trial) => trial,
+            Err(error) => return left_out(format!("expected the record of a trial, got {error}")),
+        };
+        let place = |task: &str, model: &str, seed: u64| format!("{task} {seed}, {model}");
+        let (expected, got) = (place(task, model, seed), place(&trial.task, &trial.model, trial.seed));
+        if expected != got {
+            return left_out(format!("expected the record of {expected}, got that of {got}"));
+        }
+        Ok(Some(trial))
     }
 
     fn trial_path(&self, task: &str, model: &str, seed: u64) -> PathBuf {
@@ -260,14 +301,13 @@ impl Folder {
     }
 }
 
-/// The names in a folder; none if there is no such folder.
+/// The names in a folder of the run; none if there is no such folder yet.
 pub(crate) fn file_names(folder: &Path) -> anyhow::Result<Vec<String>> {
-    let names = match fs::read_dir(folder) {
-        Ok(entries) => entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect(),
-        Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-        Err(e) => Err(e),
-    };
-    names.with_context(|| format!("listing {}", folder.display()))
+    if !folder.try_exists().with_context(|| folder.display().to_string())? {
+        return Ok(Vec::new());
+    }
+    let name = |path: PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(files::list(folder)?.into_iter().map(name).collect())
 }
 
 pub(crate) fn write_json<T: Serialize>(path: &Path, value: &T) -> anyhow::Result<()> {

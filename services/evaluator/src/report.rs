@@ -4,6 +4,7 @@ use crate::chart::{BarChart, Line};
 use crate::filmstrip::{self, Filmstrip};
 use crate::record::{Folder, Outcome, Run, Trial};
 use crate::summary::{Row, Summary};
+use crate::table::DEMONSTRATION_SEEDS;
 use anyhow::Context;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -24,6 +25,8 @@ struct Page<'a> {
     confidence: String,
     interval_method: &'a str,
     errors: usize,
+    /// What is said of seeds of demonstrations; empty for others.
+    seeds_warning: &'a str,
     legend: Vec<LegendEntry<'a>>,
     /// Each task with its seeds.
     seeds: Vec<(&'a str, String)>,
@@ -102,6 +105,7 @@ pub(crate) fn html(summary: &Summary, trials: &[Trial], folder: &Folder) -> anyh
         confidence: format!("{:.0} %", 100.0 * summary.confidence),
         interval_method: summary.interval_method,
         errors: summary.errors(),
+        seeds_warning: if summary.demonstration_seeds { DEMONSTRATION_SEEDS } else { "" },
         legend: (0..models).map(|index| legend_entry(&summary.run, index)).collect(),
         seeds: summary.run.tasks.iter().map(|task| (task.as_str(), seeds(trials, task))).collect(),
         chart: BarChart::new(summary),

@@ -62,6 +62,34 @@ impl Schedule {
         Ok(Self { run, folder, link, queue, planners: Planners::default(), busy, at, running, progress })
     }
 
+    /// Checks, before anything is run, that workers know the tasks and that the models fit them: one reset of each task, and
+    /// one plan of each model there. What does not answer now is left to the trials.
+    ///
+    /// # Errors
+    /// If a request is refused as wrong.
+    pub(crate) async fn check(&self) -> anyhow::Result<()> {
+        let alive = self.link.alive.borrow().clone();
+        let (Some(planner), workers) = (alive.planners.first(), alive.workers.len()) else { return Ok(()) };
+        let mut checks = JoinSet::new();
+        for (index, worker) in alive.workers.iter().enumerate() {
+            // One after the other on each worker, which has one episode at a time.
+            let variations = self.queue.first_variations().into_iter().skip(index).step_by(workers);
+            let variations: Vec<_> = variations.collect();
+            let services = Services { planner: planner.clone(), worker: worker.clone() };
+            let (run, link) = (self.run.clone(), self.link.clone());
+            checks.spawn(async move {
+                for variation in variations {
+                    trial::check(&link, &services, &run, &variation).await?;
+                }
+                anyhow::Ok(())
+            });
+        }
+        while let Some(checked) = checks.join_next().await {
+            checked.context("checking the tasks")??;
+        }
+        Ok(())
+    }
+
     /// Runs every trial. Without planner or worker it waits for `patience`, then records what is left as errors.
     ///
     /// # Errors

@@ -16,6 +16,8 @@ pub struct Summary {
     pub interval_method: &'static str,
     /// Their confidence.
     pub confidence: f64,
+    /// Whether models may have been trained on the very variations: the seeds are those of demonstrations.
+    pub demonstration_seeds: bool,
     /// One for each task and model, in the run's order.
     pub rows: Vec<Row>,
 }
@@ -76,7 +78,8 @@ impl Summary {
             Row::new(task, model, trials)
         };
         let rows = run.tasks.iter().flat_map(|task| run.models.iter().map(move |model| row(task, model))).collect();
-        Self { run, interval_method: "Wilson score", confidence: CONFIDENCE, rows }
+        let demonstration_seeds = run.has_demonstration_seeds();
+        Self { run, demonstration_seeds, interval_method: "Wilson score", confidence: CONFIDENCE, rows }
     }
 
     /// Trials that were not brought to an end.

@@ -4,6 +4,9 @@ use crate::record::GoalSource;
 use crate::summary::{Row, Summary};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
 
+/// What is said of a run with seeds of demonstrations.
+pub(crate) const DEMONSTRATION_SEEDS: &str = "not an evaluation: the seeds are those of demonstrations, so that models may have been trained on the very variations";
+
 /// The summary as a table, one row for each task and model, followed by what went wrong.
 pub fn table(summary: &Summary) -> String {
     let interval = format!("{:.0} % interval", 100.0 * summary.confidence);
@@ -25,7 +28,8 @@ pub fn table(summary: &Summary) -> String {
         GoalSource::SameVariation => "",
         GoalSource::OtherVariation => "\nablation: the goal shows the end of another variation",
     };
-    format!("{table}{ablation}{}", errors.collect::<String>())
+    let seeds = if summary.demonstration_seeds { format!("\n{DEMONSTRATION_SEEDS}") } else { String::new() };
+    format!("{table}{ablation}{seeds}{}", errors.collect::<String>())
 }
 
 fn cells(row: &Row) -> [String; 8] {

@@ -2,7 +2,8 @@
 
 use crate::link::{Link, is_outage};
 use crate::presence::Service;
-use crate::record::{self, GoalSource, Model, Outcome, StageTimes};
+use crate::record::{self, GoalSource, Model, Outcome, Run, StageTimes};
+use anyhow::bail;
 use recording::plans::{Exchange, Plans};
 use std::time::Instant;
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
@@ -75,6 +76,52 @@ impl Fault {
     }
 }
 
+/// Checks that a worker knows a task, and that every model takes what its goal is; seeds that the expert does not solve are
+/// passed over.
+///
+/// # Errors
+/// Why a request was refused as wrong.
+pub(crate) async fn check(
+    link: &Link,
+    services: &Services,
+    run: &Run,
+    Variation { task, seed }: &Variation,
+) -> anyhow::Result<()> {
+    for seed in *seed..seed.saturating_add(GOAL_TRIES.into()) {
+        let variation = Variation { task: task.clone(), seed };
+        match check_variation(link, services, run, &variation).await {
+            Err((_, Fault::NoGoalImage)) => (),
+            Err((by, Fault::Refused(error))) => bail!("{task} {seed}, {by}: refused: {error}"),
+            Err((by, Fault::Outage { error, .. } | Fault::Broken { error, .. })) => {
+                tracing::debug!("{task} {seed}, {by}: not checked: {error}");
+                return Ok(());
+            }
+            Ok(()) => return Ok(()),
+        }
+    }
+    Ok(())
+}
+
+/// The same of one variation; a fault comes with who found it.
+async fn check_variation(
+    link: &Link,
+    Services { planner, worker }: &Services,
+    run: &Run,
+    variation: &Variation,
+) -> Result<(), (String, Fault)> {
+    let (planner, worker) = (Service::Planner(planner.clone()), Service::Worker(worker.clone()));
+    let by_worker = |error| (worker.to_string(), Fault::new(worker.clone(), error));
+    let reset = link.reset(&worker, variation, run.goal).await.map_err(by_worker)?;
+    for model in &run.models {
+        let by_planner = |error| (model.name.clone(), Fault::new(planner.clone(), error));
+        let goal = link.goal(&planner, &reset).await.map_err(by_planner)?;
+        let observation = reset.hand_position.map_or_else(|| reset.observation.clone().into(), Observation::from);
+        let request = link.plan_request(model, goal, observation, plan_seed(variation.seed, 0));
+        link.plan(&planner, request).await.map_err(by_planner)?;
+    }
+    Ok(())
+}
+
 /// Runs one episode: plans anew at each step and applies the first action (model predictive control). Where the goal is a
 /// position, the model is told that and where the hand is, and no picture.
 pub(crate) async fn attempt(
@@ -89,26 +136,14 @@ pub(crate) async fn attempt(
     let by_worker = |error| Fault::new(worker.clone(), error);
     let reset = link.reset(&worker, variation, goal).await.map_err(by_worker)?;
     let start = Instant::now();
-    let goal = match reset.goal_position {
-        Some(position) => Goal::Position(position),
-        None => Goal::Id(link.register_goal(&planner, &reset.goal).await.map_err(by_planner)?),
-    };
+    let goal = link.goal(&planner, &reset).await.map_err(by_planner)?;
     let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
     let mut exchanges = Vec::new();
     let mut hand = reset.hand_position;
     let mut frames = vec![reset.observation];
     for step in 0..reset.max_steps {
-        let request = PlanRequest {
-            seed: plan_seed(variation.seed, step),
-            deadline: Some(link.timeout),
-            // The one that the run began with, though the planner may swap.
-            model_digest: Some(model.digest.clone()),
-            ..PlanRequest::new(
-                &model.name,
-                goal.clone(),
-                hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from),
-            )
-        };
+        let observation = hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from);
+        let request = link.plan_request(model, goal.clone(), observation, plan_seed(variation.seed, step));
         let asked = start.elapsed();
         let mut plan = link.plan(&planner, request.clone()).await;
         if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
@@ -160,6 +195,24 @@ impl Link {
                 Err(error) if error.field == "goal_seed" && left > 0 => goal_seed = goal_seed.map(|seed| seed + 1),
                 answer => return answer,
             }
+        }
+    }
+
+    /// The goal of an episode as the planner is told it: a position, or the id of a picture that it gets to know.
+    async fn goal(&self, planner: &Service, reset: &ResetResponse) -> Result<Goal, Error> {
+        Ok(match reset.goal_position {
+            Some(position) => Goal::Position(position),
+            None => Goal::Id(self.register_goal(planner, &reset.goal).await?),
+        })
+    }
+
+    fn plan_request(&self, model: &Model, goal: Goal, observation: Observation, seed: u64) -> PlanRequest {
+        PlanRequest {
+            seed,
+            deadline: Some(self.timeout),
+            // The one that the run began with, though the planner may swap.
+            model_digest: Some(model.digest.clone()),
+            ..PlanRequest::new(&model.name, goal, observation)
         }
     }
 

@@ -93,6 +93,7 @@ async fn every_model_is_run_on_the_same_variations_and_reported() {
         let cells: Vec<_> = row.split_whitespace().collect();
         assert_eq!(cells[..6], ["door-open", model, training, "0/2", "0", "%"], "{row}");
     }
+    assert!(ended.stdout.contains("not an evaluation: the seeds are those of demonstrations"));
     let html = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert_eq!(html.matches("data:image/png;base64,").count(), 2 * 9, "goal and eight frames of one failure each");
 
@@ -179,11 +180,27 @@ async fn what_cannot_be_evaluated_is_named() {
     assert!(!ended.success);
     assert!(ended.stderr.contains("--models: planner \"planner\" serves cpn, jenga, random; got upn"));
 
-    let ended = lab.evaluate(&["--tasks", "reach-the-moon"]).await;
+    // Nothing is run, though some of it could be.
+    for tasks in ["reach-the-moon", "reach,reach-the-moon"] {
+        let ended = lab.evaluate(&["--tasks", tasks, "--models", "random"]).await;
+        assert!(!ended.success);
+        assert!(
+            ended
+                .stderr
+                .contains("reach-the-moon 1000000, worker w0: refused: variation.task: expected one of assembly, ")
+        );
+        assert!(ended.stderr.contains("got 'reach-the-moon'"));
+    }
+    let ended = lab.evaluate(&["--tasks", "reach,jenga-poke-offset", "--models", "random,cpn"]).await;
     assert!(!ended.success);
-    assert!(ended.stderr.contains("refused: variation.task: expected one of assembly, "));
-    assert!(ended.stderr.contains("got 'reach-the-moon'"));
+    assert!(ended.stderr.contains("jenga-poke-offset 1000000, cpn: refused: "), "{}", ended.stderr);
+    let ended = lab.evaluate(&["--tasks", "reach,"]).await;
+    assert!(!ended.success);
+    assert!(ended.stderr.contains("--tasks: expected names, got \"reach,\""), "{}", ended.stderr);
+    assert_eq!(files(&lab.out()).len(), 1, "there is nothing but the lock");
 
+    let ended = lab.evaluate(&["--tasks", "reach", "--models", "random", "--trials", "1"]).await;
+    assert!(ended.success);
     // The folder is now that of a run with goals of the same variation.
     let ended = lab.evaluate(&["--tasks", "reach", "--goal", "other-variation"]).await;
     assert!(!ended.success);

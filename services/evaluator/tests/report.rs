@@ -4,6 +4,9 @@
 
 use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
 
+/// Seeds below are those of demonstrations.
+const FIRST_SEED: u64 = 1_000_000;
+
 fn model(name: &str, digest: &str, training_tasks: &[&str]) -> Model {
     Model {
         name: name.into(),
@@ -24,7 +27,7 @@ fn run() -> Run {
         models: vec![model("cpn", "a", &["drawer-close", "reach"]), model("random", "b", &[])],
         tasks: vec!["door-lock".into(), "drawer-close".into()],
         trials: 4,
-        first_seed: 10,
+        first_seed: FIRST_SEED + 10,
         goal: GoalSource::SameVariation,
     }
 }
@@ -39,7 +42,7 @@ fn trial(task: &str, model: &Model, seed: u64, outcome: Outcome, steps: u32) -> 
         mean_times: StageTimes::default(),
     };
     let (task, model, model_digest) = (task.into(), model.name.clone(), model.digest.clone());
-    let goal = GoalSource::SameVariation;
+    let (seed, goal) = (FIRST_SEED + seed, GoalSource::SameVariation);
     Trial { format: FORMAT, task, seed, model, model_digest, goal, outcome, episode: Some(episode) }
 }
 
@@ -108,6 +111,81 @@ fn an_ablation_of_the_goal_says_so_and_counts_no_other_trials() {
 }
 
 #[test]
+fn seeds_of_demonstrations_are_marked() {
+    let (root, folder) = folder();
+    let mark = "not an evaluation: the seeds are those of demonstrations";
+    let summary = evaluator::report(root.path()).unwrap();
+    assert!(!summary.demonstration_seeds && !evaluator::table(&summary).contains(mark));
+    folder.write_run(&Run { first_seed: FIRST_SEED - 1, ..run() }).unwrap();
+    let summary = evaluator::report(root.path()).unwrap();
+    assert!(evaluator::table(&summary).contains(mark));
+    let text = |name: &str| std::fs::read_to_string(folder.path(name)).unwrap();
+    assert!(text("report.html").contains("Not an evaluation: the seeds are those of demonstrations"));
+    assert!(text("summary.json").contains("\"demonstration_seeds\": true"));
+}
+
+/// A record counts where it says that it belongs, and one that is damaged stops nobody.
+#[test]
+fn misplaced_and_damaged_records_are_left_out() {
+    let (root, folder) = folder();
+    let rows = |rows: &[evaluator::Row]| rows.iter().map(|row| (row.successes, row.trials)).collect::<Vec<_>>();
+    assert_eq!(rows(&evaluator::report(root.path()).unwrap().rows), [(3, 4), (0, 4), (1, 3), (1, 4)]);
+    let path = |place: &str| folder.path("trials").join(place);
+    let success = std::fs::read(path("door-lock/cpn/1000010.json")).unwrap();
+    for place in ["door-lock/cpn/1000014.json", "door-lock/random/1000010.json", "drawer-close/cpn/1000011.json"] {
+        std::fs::write(path(place), &success).unwrap();
+    }
+    std::fs::write(path("drawer-close/random/1000012.json"), "").unwrap();
+    std::fs::write(path("drawer-close/random/1000013.json"), &success[..success.len() / 2]).unwrap();
+    std::fs::write(path("drawer-close/random/._1000013.json"), "AppleDouble").unwrap();
+    assert_eq!(rows(&evaluator::report(root.path()).unwrap().rows), [(3, 3), (0, 3), (1, 2), (1, 2)]);
+
+    std::fs::write(folder.path("run.json"), "").unwrap();
+    let error = format!("{:#}", evaluator::report(root.path()).unwrap_err());
+    assert!(error.starts_with("remove the file if it is damaged") && error.contains("run.json"), "{error}");
+}
+
+fn command(arguments: &[&str], out: &std::path::Path) -> std::process::Command {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_cpn-eval"));
+    command.args(arguments).arg("--out").arg(out);
+    command
+}
+
+#[test]
+fn a_closed_output_ends_quietly_and_a_full_disk_is_named() {
+    let (root, folder) = folder();
+    folder.write_trial(&trial("drawer-close", &run().models[0], 13, Outcome::Success, 30)).unwrap();
+    let full = || std::fs::File::options().write(true).open("/dev/full").unwrap();
+    for arguments in [&["report"][..], &["report", "--json"]] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = command(arguments, root.path()).stdout(writer).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        let output = command(arguments, root.path()).stdout(full()).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(1) && said.contains("Error: standard output /dev/full"), "{said}");
+        let output = command(arguments, root.path()).stderr(full()).output().unwrap();
+        assert!(output.status.success() && !output.stdout.is_empty(), "a log that cannot be written is no error");
+    }
+}
+
+#[test]
+fn a_folder_has_one_run_at_a_time() {
+    let root = tempfile::tempdir().unwrap();
+    let keeper = service_kit::files::take_over(root.path()).unwrap();
+    let run = || {
+        let output = command(&["run", "--tasks", "reach", "--wait-secs", "1"], root.path()).output().unwrap();
+        assert!(!output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let said = run();
+    let expected = format!("expected one that no process keeps, got that of process {} (", std::process::id());
+    assert!(said.contains("--out") && said.contains(&expected), "{said}");
+    drop(keeper);
+    assert!(run().contains("still without planner"));
+}
+
+#[test]
 fn the_page_needs_nothing_else_and_escapes_what_it_shows() {
     let (root, folder) = folder();
     evaluator::report(root.path()).unwrap();
@@ -117,7 +195,7 @@ fn the_page_needs_nothing_else_and_escapes_what_it_shows() {
         "door-lock",
         "held out",
         "&lt;an answer&gt;",
-        "10–11, 13–14",
+        "1000010–1000011, 1000013–1000014",
         "First failure",
         "planner-0, planner-1",
     ] {
@@ -149,5 +227,5 @@ fn a_record_of_another_format_is_refused() {
     let trial = trial("door-lock", &run().models[0], 11, Outcome::Success, 50);
     folder.write_trial(&Trial { format: FORMAT + 1, ..trial }).unwrap();
     let error = evaluator::report(root.path()).unwrap_err().to_string();
-    assert!(error.ends_with("door-lock/cpn/11.json: expected format 2, got 3"), "{error}");
+    assert!(error.ends_with("door-lock/cpn/1000011.json: expected format 2, got 3"), "{error}");
 }

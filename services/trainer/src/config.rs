@@ -1,6 +1,6 @@
 //! What a training run can be told.
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use cpn::{ModelConfig, Preset, Recipe, Training};
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
@@ -8,11 +8,14 @@ use figment::value::Value;
 use serde::{Deserialize, Serialize};
 use service_kit::config;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// How the names of environment variables begin.
 const PREFIX: &str = "CPN_TRAIN_";
 /// Settings that are text, whatever they look like.
 const TEXTS: [&str; 4] = ["preset", "dataset", "out", "run_dir"];
+/// Most threads of a run: more than any machine has to gain from.
+const MAX_THREADS: usize = 1024;
 /// Settings of a run, by their names.
 const FIELDS: [&str; 10] = [
     "preset",
@@ -115,8 +118,33 @@ impl Config {
     fn over_preset(settings: Figment) -> anyhow::Result<Self> {
         let preset = if settings.contains("preset") { settings.extract_inner("preset")? } else { Preset::Cpn };
         let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(settings).extract()?;
-        config.recipe().validate()?;
+        config.validate()?;
         Ok(config)
+    }
+
+    /// Checks what can be checked before anything is read.
+    ///
+    /// # Errors
+    /// Names the field, what was expected and what came.
+    pub fn validate(&self) -> anyhow::Result<()> {
+        self.recipe().validate()?;
+        let threads = self.threads;
+        ensure!((1..=MAX_THREADS).contains(&threads), "threads: expected 1 to {MAX_THREADS}, got {threads}");
+        let seconds = self.save_interval_seconds;
+        ensure!(
+            Duration::try_from_secs_f64(seconds).is_ok(),
+            "save_interval_seconds: expected a number of seconds from 0 on, got {seconds:?}"
+        );
+        ensure!(
+            self.out.file_name().is_some(),
+            "out: expected the path of a file, got {:?}",
+            self.out.display().to_string()
+        );
+        for (index, task) in self.hold_out.iter().enumerate() {
+            let known = self.hold_out[..index].contains(task);
+            ensure!(!task.is_empty() && !known, "hold_out: expected tasks, each once, got {:?}", self.hold_out);
+        }
+        Ok(())
     }
 
     /// The run's name: the stem of its checkpoint's file.

@@ -2,11 +2,14 @@
 
 use crate::curve;
 use crate::progress::{Observer, Progress, ends_epoch};
-use anyhow::Context;
+use crate::train;
+use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
+use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
-use std::io::Write;
+use std::io::{ErrorKind, Write};
+use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 use tfrecord::protobuf::event::What;
@@ -20,8 +23,8 @@ const MAX_NOTED: u64 = 1000;
 const PROGRESS: &str = "progress.jsonl";
 /// How the names of TensorBoard's files begin.
 const EVENTS: &str = "events.out.tfevents.";
-/// Name of the file that the run has locked.
-const LOCK: &str = ".lock";
+/// Name of the file that says whose folder it is: the path of the run's checkpoint.
+const OWNER: &str = "checkpoint.txt";
 
 /// A line of `progress.jsonl`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -52,15 +55,15 @@ struct Open {
 }
 
 impl Journal {
-    /// The journal in a folder, of a run of this name.
+    /// The journal in a folder, of the run that writes this checkpoint.
     ///
     /// # Errors
-    /// If the folder cannot be made, or another process has it.
-    pub fn open(folder: PathBuf, name: String) -> anyhow::Result<Self> {
-        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-        let lock = File::create(folder.join(LOCK)).with_context(|| folder.display().to_string())?;
-        lock.try_lock().with_context(|| format!("{}: expected a folder that no run has", folder.display()))?;
+    /// If the folder cannot be made, another process has it, or it is that of a run whose checkpoint is another file.
+    pub fn open(folder: PathBuf, checkpoint: &Path) -> anyhow::Result<Self> {
+        let lock = files::take_over(&folder).context("run_dir")?;
         files::remove_unfinished(&folder)?;
+        own(&folder, &std::path::absolute(checkpoint)?)?;
+        let name = checkpoint.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok(Self { folder, name, _lock: lock, entries: Vec::new(), open: None })
     }
 
@@ -96,6 +99,27 @@ impl Observer for Journal {
     }
 }
 
+/// Says whose folder it is, unless it is that of another run, whose curve would be lost. A run of which nothing is left but
+/// the curve, or whose folders were moved, gives way.
+fn own(folder: &Path, checkpoint: &Path) -> anyhow::Result<()> {
+    let path = folder.join(OWNER);
+    let owner = match std::fs::read(&path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => PathBuf::new(),
+        owner => PathBuf::from(OsString::from_vec(owner.with_context(|| path.display().to_string())?)),
+    };
+    if owner == checkpoint {
+        return Ok(());
+    }
+    ensure!(
+        !owner.exists() && !owner.with_extension(train::RESUME).exists(),
+        "run_dir: expected a folder of {}, got {}, which is that of {}: give each run its own",
+        checkpoint.display(),
+        folder.display(),
+        owner.display()
+    );
+    files::write_atomically(&path, checkpoint.as_os_str().as_bytes())
+}
+
 /// What is noted in a folder; a line that was cut by a crash, and what follows it, is not.
 ///
 /// # Errors
@@ -120,8 +144,8 @@ fn line(entry: &Entry) -> serde_json::Result<Vec<u8>> {
 
 /// A new event file with what is known, in place of the old ones.
 fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<File>> {
-    let old = std::fs::read_dir(folder)?.collect::<Result<Vec<_>, _>>()?;
-    let old: Vec<_> = old.iter().filter(|file| file.file_name().to_string_lossy().starts_with(EVENTS)).collect();
+    let mut old = files::list(folder)?;
+    old.retain(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(EVENTS)));
     // The name grows, so that a TensorBoard that is open goes on to this file.
     let path = folder.join(format!("{EVENTS}{:.6}.{}", unix_seconds(), std::process::id()));
     let mut events = EventWriter::from_writer(File::create_new(&path)?, Default::default())?;
@@ -133,7 +157,7 @@ fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<
         write_events(&mut events, entry)?;
     }
     for file in old {
-        std::fs::remove_file(file.path())?;
+        std::fs::remove_file(file)?;
     }
     Ok(events)
 }

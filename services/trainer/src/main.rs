@@ -89,7 +89,7 @@ async fn train(config: Config, json: bool) -> anyhow::Result<Outcome> {
         let stopped = StopIf(move |_| seen.load(Ordering::Relaxed));
         let shown: Box<dyn Observer> =
             if json { Box::new(JsonLines::default()) } else { Box::new(Bar::new(&config.name())) };
-        let journal = Journal::open(config.run_dir(), config.name())?;
+        let journal = Journal::open(config.run_dir(), &config.out)?;
         let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), shown, Box::new(journal)];
         train::run(&config, &mut observers)
     });

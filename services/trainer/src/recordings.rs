@@ -134,9 +134,9 @@ impl Recordings {
         Ok(Self { folder, _lock: lock, index: Mutex::new(Index(index)), writing: Mutex::new(()) })
     }
 
-    /// Whether an episode is kept.
+    /// Whether an episode was kept when it was last asked for; the disk is not looked at.
     pub fn contains(&self, episode_id: &str) -> bool {
-        self.index().get(&self.folder, episode_id).is_some()
+        self.index().0.contains_key(episode_id)
     }
 
     /// What is known of a kept episode.

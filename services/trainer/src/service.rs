@@ -101,7 +101,10 @@ pub struct Service {
 pub async fn start(config: Config) -> anyhow::Result<Service> {
     let Config { name, dataset, checkpoints, keep_versions, runs, max_runs, program, .. } = config.clone();
     let network = &config.session;
+    // All settings are checked before the first is acted upon.
+    let token = key::trainer_alive(&name)?;
     let access = Access::new(network.tls()?.is_some(), config.tokens.as_deref())?;
+    let listen = network.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
     if let Some(address) = config.metrics_listen {
         let listen = network.listen_at(address, metrics::MAX_CONNECTIONS)?;
         metrics::serve(listen, access.clone(), access::may_scrape).await?;
@@ -119,9 +122,7 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
     };
     let (recordings, versions, runs) = tokio::task::spawn_blocking(open).await??;
     // Before the network is waited for, so that health tells of it.
-    let listen = network.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
     let mut grpc = grpc::start(runs.clone(), listen, access).await?;
-    let token = key::trainer_alive(&name)?;
     let session = session::open(network).await?;
     session::claim(&session, network, &token).await?;
     let connection = Connection::follow(&session, network);

@@ -19,6 +19,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 use tracing::info;
 
+/// How the name of a run's saved state ends.
+pub(crate) const RESUME: &str = "resume";
+
 /// How a run ended.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -51,17 +54,19 @@ struct ResumePoint {
 /// Trains until the checkpoint is written or `observer` stops it; from a saved state if there is one.
 ///
 /// # Errors
-/// If the settings are out of range or do not fit the demonstrations, these cannot be read, the saved state belongs to
-/// another run, the loss is no longer finite, a file cannot be written, or the observer fails.
+/// If the settings are out of range or do not fit the demonstrations, these cannot be read, another process writes the
+/// checkpoint, the saved state belongs to another run, the loss is no longer finite, a file cannot be written, or the observer fails.
 pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outcome> {
+    config.validate()?;
+    ensure!(!config.out.is_dir(), "out: expected the path of a file, got that of a folder, {}", config.out.display());
     let recipe = config.recipe();
-    recipe.validate()?;
     let Recipe { model, training } = &recipe;
     tch::set_num_threads(i32::try_from(config.threads).context("threads: expected a number of them")?);
     let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
     let dataset = Dataset::load(&config.dataset, &config.hold_out, model.encoder.input())?;
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
+    let _keeper = files::take_over_file(&config.out).context("out")?;
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
     if training.precision.where_faster() != training.precision {
         info!("training.precision: the processor has no instructions for bfloat16 (AVX512-BF16); training in float32");
@@ -69,7 +74,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     info!(tasks = tasks.len(), episodes = dataset.episodes().len(), samples = dataset.sample_count(), "demonstrations");
 
     let mut learner = Learner::new(&recipe, config.seed, config.threads);
-    let state = Saved { path: config.out.with_extension("resume"), config, dataset: &dataset };
+    let state = Saved { path: config.out.with_extension(RESUME), config, dataset: &dataset };
     let (start, loss) = state.resume(&mut learner.optimiser)?;
     observer.begin(start)?;
 

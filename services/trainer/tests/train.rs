@@ -213,3 +213,62 @@ fn bad_input_is_named() {
     assert!(message.contains("reach-1.mcap") && message.contains("recording:"), "{message}");
     assert!(!good.out.exists());
 }
+
+#[test]
+fn settings_are_checked_before_anything_is_read() {
+    let load = |change: &str| Config::load(None, &serde_json::json!({"dataset": "nowhere"}), &[change.to_owned()]);
+    for (change, reason) in [
+        ("threads=0", "threads: expected 1 to 1024, got 0"),
+        ("threads=100000", "threads: expected 1 to 1024, got 100000"),
+        ("save_interval_seconds=-1.0", "save_interval_seconds: expected a number of seconds from 0 on, got -1.0"),
+        ("out=models/..", "out: expected the path of a file, got \"models/..\""),
+        ("hold_out=[\"reach\", \"\"]", "hold_out: expected tasks, each once, got [\"reach\", \"\"]"),
+        ("hold_out=[\"reach\", \"reach\"]", "hold_out: expected tasks, each once, got [\"reach\", \"reach\"]"),
+    ] {
+        assert_eq!(format!("{:#}", load(change).unwrap_err()), reason);
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(folder.path(), "x");
+    finished(&Config { threads: 1024, ..config.clone() });
+    let config = Config { out: folder.path().join("folder"), ..config };
+    std::fs::create_dir(&config.out).unwrap();
+    let error = format!("{:#}", train::run(&config, &mut StopIf(|_| false)).unwrap_err());
+    assert!(error.starts_with("out: expected the path of a file, got that of a folder"), "{error}");
+}
+
+#[test]
+fn a_checkpoint_is_written_by_one_process() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(folder.path(), "x");
+    let keeper = service_kit::files::take_over_file(&config.out).unwrap();
+    let error = format!("{:#}", train::run(&config, &mut StopIf(|_| false)).unwrap_err());
+    let expected = format!("out: {}: expected one that no process keeps, got that of process ", config.out.display());
+    assert!(error.starts_with(&expected), "{error}");
+    drop(keeper);
+    finished(&config);
+}
+
+/// The curve of a run is not that of another whose checkpoint has the same name elsewhere.
+#[test]
+fn a_curve_is_not_lost_to_another_run() {
+    let folder = tempfile::tempdir().unwrap();
+    config(folder.path(), "data");
+    let run = |out: &str| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_cpn-trainer"));
+        command.args(["train", "--preset", "paper-bc", "--dataset", "data", "--out", out]);
+        command.args(["--set", "training.epochs=1", "--set", "training.batch_size=12"]);
+        let output = command.current_dir(folder.path()).output().unwrap();
+        (output.status.success(), String::from_utf8(output.stderr).unwrap())
+    };
+    let curve = || std::fs::read(folder.path().join("runs/training/x/progress.jsonl")).unwrap();
+    assert!(run("a/x.safetensors").0);
+    let before = curve();
+    let (success, said) = run("b/x.safetensors");
+    assert!(!success && said.contains("run_dir: expected a folder of ") && said.contains("a/x.safetensors"), "{said}");
+    assert!(curve() == before && !folder.path().join("b").exists());
+    // The same run anew has it, and so has the other once nothing else is left of the first.
+    assert!(run("a/x.safetensors").0);
+    assert_ne!(curve(), before);
+    std::fs::remove_dir_all(folder.path().join("a")).unwrap();
+    assert!(run("b/x.safetensors").0);
+}
