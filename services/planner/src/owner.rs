@@ -40,6 +40,10 @@ pub(crate) struct Owner {
 }
 
 /// What is to be done next.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "it is taken apart where it is made, and a box would be allocated for each plan"
+)]
 pub(crate) enum Step {
     /// Another step.
     Next,
