@@ -35,7 +35,7 @@ pub(crate) struct Owner {
     load: Arc<Load>,
     batch_size: usize,
     batch_delay: Duration,
-    /// The answer after which nobody waits.
+    /// The answer after which nobody waits, if to send it may block.
     last: Option<(Reply, Answer)>,
 }
 
@@ -226,7 +226,8 @@ impl Owner {
         if let Ok(response) = &answer {
             observe(response.times);
         }
-        if self.last.is_none() && self.load.tasks() == 0 && !self.load.has_stuck() {
+        let alone = self.load.tasks() == 0 && !self.load.has_stuck();
+        if reply.may_block() && alone && self.last.is_none() {
             self.last = Some((reply, answer));
         } else {
             reply.send(answer);

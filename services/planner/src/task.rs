@@ -113,6 +113,11 @@ impl Reply {
         matches!(self, Self::Awaited(sender) if sender.is_closed())
     }
 
+    /// Whether it may take long to send the answer from the same thread.
+    pub(crate) fn may_block(&self) -> bool {
+        matches!(self, Self::Called(..))
+    }
+
     /// Hands the answer over, and does not block.
     pub(crate) fn send(self, answer: Answer) {
         match self {
