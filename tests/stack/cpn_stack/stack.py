@@ -2,10 +2,11 @@
 
 import json
 import os
+import random
 import socket
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cpn_stack import docker as engine
@@ -30,10 +31,12 @@ PORTS = (
 
 
 def _free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [open_socket.getsockname()[1] for open_socket in sockets]
-    for open_socket in sockets:
-        open_socket.close()
+    """Ports that nobody listens on, outside of the range that systems give away by themselves."""
+    ports: list[int] = []
+    while len(ports) < count:
+        port = random.randint(15_000, 32_000)
+        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            ports.append(port)
     return ports
 
 
@@ -70,7 +73,9 @@ class Stack:
     def down(self) -> None:
         """Removes everything, volumes too."""
         for name in self._further:
-            docker("rm", "--force", "--volumes", name)
+            # Some are gone already.
+            with suppress(engine.DockerError):
+                docker("rm", "--force", "--volumes", name)
         self.compose("down", "--volumes", "--remove-orphans", "--timeout", "2")
 
     def containers(self, service: str) -> list[str]:

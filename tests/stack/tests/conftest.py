@@ -1,4 +1,5 @@
 import logging
+import signal
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,9 @@ TRIALS = 16
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     del session
+    # So that the stack is taken down.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: pytest.exit("told to stop"))
     if reason := engine.missing():
         warnings.warn(f"THE STACK IS NOT TESTED HERE: {reason}", stacklevel=1)
 
