@@ -61,7 +61,7 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     let timeout = Duration::from_secs(args.timeout_secs);
     let start = Instant::now();
     let session = link::join(&args.session, patience).await?;
-    let _connection = Connection::follow(&session, &args.session);
+    let connection = Connection::follow(&session, &args.session);
     let mut alive = presence::follow(&session, &args.planner).await?;
     presence::wait(&session, &mut alive, &args.planner, args.workers, start, patience).await?;
 
@@ -90,6 +90,8 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     schedule.check().await?;
     folder.write_run(&run)?;
     schedule.drive(patience).await?;
+    // A session that closes is no outage to be warned of.
+    drop(connection);
     // What is reported is in the folder by now.
     if let Err(error) = session.close().await {
         tracing::warn!("closing the zenoh session: {error}");
