@@ -45,7 +45,8 @@ class SmallDisk:
         self.run("rm /small/filler")
 
     def remove(self) -> None:
-        docker("rm", "--force", self.name)
+        users = docker("ps", "--all", "--quiet", "--filter", f"volume={self.name}").split()
+        docker("rm", "--force", *users)
         docker("volume", "rm", self.name)
 
 
