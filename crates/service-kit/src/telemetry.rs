@@ -30,10 +30,7 @@ pub struct Telemetry(Option<SdkTracerProvider>);
 /// If the endpoint is malformed.
 pub fn init(service: &'static str) -> anyhow::Result<Telemetry> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
-    let logs = tracing_subscriber::fmt::layer()
-        .log_internal_errors(false)
-        .with_writer(stderr)
-        .with_ansi(stderr().is_terminal());
+    let logs = tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal());
     let provider =
         env::var_os(ENDPOINT).filter(|endpoint| !endpoint.is_empty()).map(|_| provider(service)).transpose()?;
     let traces = provider.as_ref().map(|provider| {
