@@ -4,6 +4,7 @@ use crate::config::Config;
 use crate::goals::Goals;
 use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
+use crate::outbox::Outbox;
 use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask};
@@ -88,6 +89,11 @@ impl PlannerCore {
             Ok(task) => self.thread.enqueue_then(task, Box::new(reply)),
             Err(error) => self.thread.call(Box::new(reply), error),
         }
+    }
+
+    /// For what may block.
+    pub(crate) fn outbox(&self) -> Outbox {
+        self.thread.outbox()
     }
 
     /// What the model thread is to do.

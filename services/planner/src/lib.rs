@@ -13,6 +13,7 @@ mod load;
 pub mod model;
 mod model_thread;
 mod openpi;
+mod outbox;
 mod owner;
 mod searches;
 mod served;

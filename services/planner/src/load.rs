@@ -156,16 +156,11 @@ impl Load {
         self.tasks.load(Ordering::SeqCst)
     }
 
-    /// The models' thread is about to send an answer itself, if nobody waits; none if somebody does.
-    pub(crate) fn begin_reply(&self) -> Option<u64> {
+    /// The models' thread sends an answer itself from now on.
+    pub(crate) fn begin_reply(&self) -> u64 {
         let reply = self.replies.fetch_add(1, Ordering::Relaxed) + 1;
-        // Who comes now sees it, or is seen.
         self.replying.store(reply, Ordering::SeqCst);
-        if self.tasks() == 0 {
-            return Some(reply);
-        }
-        self.replying.store(0, Ordering::SeqCst);
-        None
+        reply
     }
 
     /// The answer is sent; false if another thread has taken over in the meantime.

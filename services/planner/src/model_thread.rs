@@ -4,21 +4,20 @@
 use crate::config::Config;
 use crate::load::{Estimate, Load};
 use crate::model::Model;
+use crate::outbox::{Outbox, PATIENCE};
 use crate::owner::{Owner, Step};
 use crate::task::{Answer, PlanTask, Reply, Waiting, queue_full, stopped, too_late, too_long, too_many};
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, SendError};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use std::{fmt, io, thread};
 use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use tracing::{debug_span, warn};
 use wire::Error;
 use wire::planner::ModelInfo;
-
-/// How long an answer may take to send before another thread takes over the models.
-const PATIENCE: Duration = Duration::from_millis(2);
 
 /// The caller's side of the thread.
 #[derive(Debug, Clone)]
@@ -33,6 +32,8 @@ pub(crate) struct ModelThread {
     lead: Arc<Mutex<Option<Lead>>>,
     threads: u16,
     runtime: Handle,
+    outbox: Outbox,
+    is_watched: Arc<AtomicBool>,
     models: watch::Receiver<BTreeMap<String, ModelInfo>>,
 }
 
@@ -66,8 +67,20 @@ impl ModelThread {
         let [places, searches] = [capacity, capacity.div_ceil(2)].map(|count| Arc::new(Semaphore::new(count.into())));
         let lead = Arc::new(Mutex::new(Some(Lead { owner, jobs: receiver })));
         let (threads, runtime) = (config.threads.get(), Handle::current());
-        let started =
-            Self { jobs: sender, places, capacity, searches, load, lead, threads, runtime, models: subscribed };
+        let (outbox, is_watched) = (Outbox::new(runtime.clone()), Arc::default());
+        let started = Self {
+            jobs: sender,
+            places,
+            capacity,
+            searches,
+            load,
+            lead,
+            threads,
+            runtime,
+            outbox,
+            is_watched,
+            models: subscribed,
+        };
         started.spawn(|_| true)?;
         Ok(started)
     }
@@ -84,13 +97,29 @@ impl ModelThread {
         Ok(())
     }
 
-    /// Sees to it that somebody who waits does not wait for an answer to another to be sent.
+    /// Sees to it, as long as anybody waits, that nobody waits for an answer to another to be sent.
     fn watch(&self) {
-        let Some(reply) = self.load.replying() else { return };
+        if self.is_watched.swap(true, Ordering::SeqCst) {
+            return;
+        }
         let this = self.clone();
         self.runtime.spawn(async move {
-            tokio::time::sleep(PATIENCE).await;
-            this.take_over(reply);
+            let mut before = None;
+            loop {
+                tokio::time::sleep(PATIENCE).await;
+                let reply = this.load.replying();
+                if let Some(reply) = reply.filter(|_| reply == before) {
+                    this.take_over(reply);
+                }
+                before = reply;
+                if this.load.tasks() == 0 && reply.is_none() {
+                    this.is_watched.store(false, Ordering::SeqCst);
+                    // Who has come in the meantime is seen here, or sees that nobody watches.
+                    if this.load.tasks() == 0 || this.is_watched.swap(true, Ordering::SeqCst) {
+                        return;
+                    }
+                }
+            }
         });
     }
 
@@ -141,12 +170,17 @@ impl ModelThread {
 
     /// The same for what is called with the answer, and may block.
     pub(crate) fn enqueue_then(&self, task: PlanTask, call: Box<dyn FnOnce(Answer) + Send>) {
-        self.enqueue(task, Reply::Called(call, self.runtime.clone()));
+        self.enqueue(task, Reply::Called(call, self.outbox.clone()));
+    }
+
+    /// For what may block.
+    pub(crate) fn outbox(&self) -> Outbox {
+        self.outbox.clone()
     }
 
     /// Calls it with an error at once.
     pub(crate) fn call(&self, call: Box<dyn FnOnce(Answer) + Send>, error: Error) {
-        Reply::Called(call, self.runtime.clone()).send(Err(error));
+        Reply::Called(call, self.outbox.clone()).send(Err(error));
     }
 
     /// Has a job done that is no plan.
@@ -227,9 +261,9 @@ impl ModelThread {
     }
 }
 
-/// Owns the models until there is nothing more to do, or another thread has taken over. An answer after which nobody waits is sent
-/// from here: another thread would have to be woken. Who comes while that blocks, because its client does not read, has another
-/// thread take over the models.
+/// Owns the models until there is nothing more to do, or another thread has taken over. What may block is sent from here, without
+/// the models: another thread would have to be woken. If it does block, because its client does not read, another thread takes over
+/// the models and what is to be sent after it.
 fn work(lead: &Mutex<Option<Lead>>, load: &Load) {
     let lock = || lead.lock().unwrap_or_else(PoisonError::into_inner);
     let mut owned = lock();
@@ -237,17 +271,16 @@ fn work(lead: &Mutex<Option<Lead>>, load: &Load) {
         match owner.step(jobs) {
             Step::Next => {}
             Step::End => *owned = None,
-            Step::Reply(reply, answer) => match load.begin_reply() {
-                None => reply.send(answer),
-                Some(number) => {
-                    drop(owned);
-                    reply.send_here(answer);
-                    if !load.end_reply(number) {
-                        return;
-                    }
-                    owned = lock();
+            Step::Reply(reply, answer) if load.has_stuck() => reply.send(answer),
+            Step::Reply(reply, answer) => {
+                let number = load.begin_reply();
+                drop(owned);
+                reply.send_here(answer);
+                if !load.end_reply(number) {
+                    return;
                 }
-            },
+                owned = lock();
+            }
         }
     }
 }

@@ -35,8 +35,8 @@ pub(crate) struct Owner {
     load: Arc<Load>,
     batch_size: usize,
     batch_delay: Duration,
-    /// The answer after which nobody waits, if to send it may block.
-    last: Option<(Reply, Answer)>,
+    /// Answers that may block whoever sends them.
+    outgoing: VecDeque<(Reply, Answer)>,
 }
 
 /// What is to be done next.
@@ -47,7 +47,7 @@ pub(crate) struct Owner {
 pub(crate) enum Step {
     /// Another step.
     Next,
-    /// To answer, while nobody waits, and then another step.
+    /// To answer, without the models, and then another step.
     Reply(Reply, Answer),
     /// Nothing, ever.
     End,
@@ -74,13 +74,16 @@ impl Owner {
             load,
             batch_size: config.batch_size.get().into(),
             batch_delay: Duration::from_millis(config.batch_delay_ms.into()),
-            last: None,
+            outgoing: VecDeque::new(),
         }
     }
 
     /// Does the next job. A search that takes long is gone on with between other jobs, for as long as these take, or while there
     /// are none.
     pub(crate) fn step(&mut self, jobs: &mpsc::Receiver<Job>) -> Step {
+        if let Some((reply, answer)) = self.outgoing.pop_front() {
+            return Step::Reply(reply, answer);
+        }
         let next = || if self.searches.is_empty() { jobs.recv().ok() } else { jobs.try_recv().ok() };
         let job = self.queue.pop_front().or_else(next);
         let (started, idle) = (Instant::now(), job.is_none());
@@ -96,6 +99,7 @@ impl Owner {
                 while !self.searches.is_empty() {
                     self.go_on(SLICE);
                 }
+                self.outgoing.drain(..).for_each(|(reply, answer)| reply.send(answer));
                 return Step::End;
             }
             None => {}
@@ -103,7 +107,7 @@ impl Owner {
         if !self.searches.is_empty() {
             self.go_on(if idle { SLICE } else { started.elapsed().min(SLICE) });
         }
-        self.last.take().map_or(Step::Next, |(reply, answer)| Step::Reply(reply, answer))
+        Step::Next
     }
 
     fn serve(&mut self, model: Model) -> Result<(), Error> {
@@ -226,9 +230,8 @@ impl Owner {
         if let Ok(response) = &answer {
             observe(response.times);
         }
-        let alone = self.load.tasks() == 0 && !self.load.has_stuck();
-        if reply.may_block() && alone && self.last.is_none() {
-            self.last = Some((reply, answer));
+        if reply.may_block() && !self.load.has_stuck() {
+            self.outgoing.push_back((reply, answer));
         } else {
             reply.send(answer);
         }

@@ -1,10 +1,10 @@
 //! A request to plan on its way to the model.
 
 use crate::load::Estimate;
+use crate::outbox::Outbox;
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 use tracing::Span;
 use wire::planner::{PlanResponse, Search, Solver};
@@ -60,8 +60,8 @@ pub(crate) type Answer = Result<PlanResponse, Error>;
 pub(crate) enum Reply {
     /// To who awaits it, or has given up.
     Awaited(oneshot::Sender<Answer>),
-    /// To what is called with it and may block, on a thread of this runtime that may.
-    Called(Box<dyn FnOnce(Answer) + Send>, Handle),
+    /// To what is called with it and may block.
+    Called(Box<dyn FnOnce(Answer) + Send>, Outbox),
 }
 
 impl PlanTask {
@@ -122,7 +122,7 @@ impl Reply {
     pub(crate) fn send(self, answer: Answer) {
         match self {
             Self::Awaited(sender) => drop(sender.send(answer)),
-            Self::Called(call, runtime) => drop(runtime.spawn_blocking(move || call(answer))),
+            Self::Called(call, outbox) => outbox.put(move || call(answer)),
         }
     }
 

@@ -13,7 +13,7 @@ use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::{AbortOnDropHandle, TaskTracker};
 use tracing::{Instrument, Span, debug_span, warn};
-use wire::planner::{ListModelsRequest, PlanRequest};
+use wire::planner::{ListModelsRequest, PlanRequest, PlanResponse};
 use wire::{Error, Message, key, query, trace};
 use zenoh::Session;
 use zenoh::bytes::ZBytes;
@@ -148,13 +148,15 @@ impl Requests {
     /// else is sent by threads that may block, as zenoh does for clients that do not read.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
         let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
-        let (places, capacity) = (Arc::clone(&self.plans), self.capacity);
+        let (places, capacity, outbox) = (Arc::clone(&self.plans), self.capacity, core.outbox());
         let own = Arc::new(key.clone());
         let callback = move |mut query: Query| {
             let own = Arc::clone(&own);
-            let place = Arc::clone(&places).try_acquire_owned().map_err(|_| queue_full(capacity));
-            let span = request_span(&query);
-            let request = place.as_ref().map_err(Clone::clone).and_then(|_| query::request::<PlanRequest>(&query));
+            let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+                // More wait to be sent than a queue holds: the one who asks on and on is to wait.
+                return reply::<PlanResponse>(&query, &own, Err(queue_full(capacity)));
+            };
+            let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
             // What waits to be sent may be much, and needs it no longer.
             query.payload_mut().into_iter().for_each(|payload| *payload = ZBytes::new());
             let deadline = request.as_ref().ok().and_then(|request| request.deadline);
@@ -168,10 +170,10 @@ impl Requests {
             };
             let clock = deadline.map(|deadline| {
                 let answer = answer.clone();
-                let blocking = runtime.clone();
+                let outbox = outbox.clone();
                 AbortOnDropHandle::new(runtime.spawn(async move {
                     tokio::time::sleep(deadline).await;
-                    blocking.spawn_blocking(move || answer(Err(too_late(deadline))));
+                    outbox.put(move || answer(Err(too_late(deadline))));
                 }))
             });
             let planned = move |plan| {
@@ -180,7 +182,7 @@ impl Requests {
             };
             match request {
                 Ok(request) => span.in_scope(|| core.plan_then(request, planned)),
-                Err(error) => drop(runtime.spawn_blocking(move || planned(Err(error)))),
+                Err(error) => outbox.put(move || planned(Err(error))),
             }
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
@@ -201,9 +203,10 @@ impl Requests {
     {
         let Self { core, places, capacity, tasks, runtime, .. } = self;
         let (core, places, capacity) = (core.clone(), Arc::clone(places), *capacity);
-        let (tasks, runtime) = (tasks.clone(), runtime.clone());
+        let (tasks, runtime, outbox) = (tasks.clone(), runtime.clone(), core.outbox());
         let own = Arc::new(key.clone());
         let callback = move |query: Query| {
+            let (outbox, in_flight) = (outbox.clone(), tasks.token());
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
             let (span, own) = (request_span(&query), Arc::clone(&own));
             let answer = async move {
@@ -215,8 +218,10 @@ impl Requests {
                 if let (Some(change), Err(error)) = (change, &result) {
                     CHANGES.refused(change, query.key_expr(), error);
                 }
-                let sending = tokio::task::spawn_blocking(move || reply(&query, &own, result));
-                drop(sending.await);
+                outbox.put(move || {
+                    reply(&query, &own, result);
+                    drop((place, in_flight));
+                });
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
