@@ -17,6 +17,8 @@ ROOT = Path(__file__).resolve().parents[3]
 USER = 10001
 """User of every service."""
 SERVICES = ("router", "planner-0", "planner-1", "trainer", "sim-worker")
+FURTHER_FILE = "CPN_TEST_COMPOSE_FILE"
+"""Environment variable with one more file for Compose, for example of other images."""
 PORTS = (
     "CPN_PORT_ROUTER",
     "CPN_PORT_PLANNER_0",
@@ -56,9 +58,10 @@ class Stack:
         files = [
             ROOT / "docker-compose.yml",
             ROOT / "tests/stack/compose.yml",
-            *([further_file] if further_file else []),
+            further_file,
+            os.environ.get(FURTHER_FILE),
         ]
-        options = [option for file in files for option in ("--file", str(file))]
+        options = [option for file in files if file for option in ("--file", str(file))]
         return engine.run([*self._command, *options, *arguments], self.environment)
 
     def up(self, *services: str, workers: int = 2) -> None:

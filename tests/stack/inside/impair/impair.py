@@ -15,13 +15,18 @@ import subprocess
 import sys
 import time
 
-INTERFACE = "eth0"
 NETFILTER = 12
 QUEUE_SUBSYSTEM = 3 << 8
 PACKET, VERDICT, CONFIG = (QUEUE_SUBSYSTEM | kind for kind in (0, 1, 2))
 ERROR = 2
 REQUEST, ACKNOWLEDGE = 1, 4
 DROP, ACCEPT = 0, 1
+
+
+def interface() -> str:
+    """Name of the interface of the default route: another one each time that a container joined its network anew."""
+    with open("/proc/net/route") as routes:
+        return next(fields[0] for fields in map(str.split, routes) if fields[1] == "00000000")
 
 
 class Queue:
@@ -79,24 +84,23 @@ def main() -> None:
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
+    device = interface()
     delay = ["delay", f"{options.delay_ms}ms", f"{options.jitter_ms}ms", "loss", f"{options.loss_percent}%"]
     netem = subprocess.run(
-        ["tc", "qdisc", "add", "dev", INTERFACE, "root", "netem", *delay], capture_output=True, text=True, check=False
+        ["tc", "qdisc", "add", "dev", device, "root", "netem", *delay], capture_output=True, text=True, check=False
     )
     if netem.returncode == 0:
         print("impaired by netem")
         try:
             signal.pause()
         finally:
-            print(
-                subprocess.run(["tc", "-s", "qdisc", "show", "dev", INTERFACE], capture_output=True, text=True).stdout
-            )
-            subprocess.run(["tc", "qdisc", "del", "dev", INTERFACE, "root"], check=True)
+            print(subprocess.run(["tc", "-s", "qdisc", "show", "dev", device], capture_output=True, text=True).stdout)
+            subprocess.run(["tc", "qdisc", "del", "dev", device, "root"], check=True)
         return
 
     print(f"no netem: {netem.stderr.strip()}")
     queue = Queue()
-    rule = ["OUTPUT", "-o", INTERFACE, "-j", "NFQUEUE", "--queue-num", "0", "--queue-bypass"]
+    rule = ["OUTPUT", "-o", device, "-j", "NFQUEUE", "--queue-num", "0", "--queue-bypass"]
     subprocess.run(["iptables", "-A", *rule], check=True)
     print("impaired by a queue of packets")
     sent = lost = reordered = 0
