@@ -29,11 +29,8 @@ pub(crate) struct ModelThread {
     /// The same for searches that are done in pieces, until they are answered: half as many.
     searches: Arc<Semaphore>,
     load: Arc<Load>,
-    lead: Arc<Mutex<Option<Lead>>>,
-    threads: u16,
-    runtime: Handle,
+    relay: Relay,
     outbox: Outbox,
-    is_watched: Arc<AtomicBool>,
     models: watch::Receiver<BTreeMap<String, ModelInfo>>,
 }
 
@@ -65,72 +62,16 @@ impl ModelThread {
         let owner = Owner::new(config, models, published, Arc::clone(&load));
         let capacity = config.queue_capacity.get();
         let [places, searches] = [capacity, capacity.div_ceil(2)].map(|count| Arc::new(Semaphore::new(count.into())));
-        let lead = Arc::new(Mutex::new(Some(Lead { owner, jobs: receiver })));
-        let (threads, runtime) = (config.threads.get(), Handle::current());
-        let (outbox, is_watched) = (Outbox::new(runtime.clone()), Arc::default());
-        let started = Self {
-            jobs: sender,
-            places,
-            capacity,
-            searches,
-            load,
-            lead,
-            threads,
-            runtime,
-            outbox,
-            is_watched,
-            models: subscribed,
+        let relay = Relay {
+            lead: Arc::new(Mutex::new(Some(Lead { owner, jobs: receiver }))),
+            load: Arc::clone(&load),
+            threads: config.threads.get(),
+            runtime: Handle::current(),
+            is_watched: Arc::default(),
         };
-        started.spawn(|_| true)?;
-        Ok(started)
-    }
-
-    /// Starts a thread that owns the models, if `takes_over` says so there.
-    fn spawn(&self, takes_over: impl FnOnce(&Load) -> bool + Send + 'static) -> io::Result<()> {
-        let (lead, load, threads) = (Arc::clone(&self.lead), Arc::clone(&self.load), self.threads);
-        thread::Builder::new().name("model".into()).spawn(move || {
-            tch::set_num_threads(threads.into());
-            if takes_over(&load) {
-                work(&lead, &load);
-            }
-        })?;
-        Ok(())
-    }
-
-    /// Sees to it, as long as anybody waits, that nobody waits for an answer to another to be sent.
-    fn watch(&self) {
-        if self.is_watched.swap(true, Ordering::SeqCst) {
-            return;
-        }
-        let this = self.clone();
-        self.runtime.spawn(async move {
-            let mut before = None;
-            loop {
-                tokio::time::sleep(PATIENCE).await;
-                let reply = this.load.replying();
-                if let Some(reply) = reply.filter(|_| reply == before) {
-                    this.take_over(reply);
-                }
-                before = reply;
-                if this.load.tasks() == 0 && reply.is_none() {
-                    this.is_watched.store(false, Ordering::SeqCst);
-                    // Who has come in the meantime is seen here, or sees that nobody watches.
-                    if this.load.tasks() == 0 || this.is_watched.swap(true, Ordering::SeqCst) {
-                        return;
-                    }
-                }
-            }
-        });
-    }
-
-    /// Lets another thread own the models, if this answer is still being sent.
-    fn take_over(&self, reply: u64) {
-        if self.load.replying() != Some(reply) {
-            return;
-        }
-        if let Err(error) = self.spawn(move |load| load.take_over(reply)) {
-            warn!(%error, "an answer is not read; those who wait do so until it is given up");
-        }
+        relay.spawn(|_| true)?;
+        let outbox = Outbox::new(Handle::current());
+        Ok(Self { jobs: sender, places, capacity, searches, load, relay, outbox, models: subscribed })
     }
 
     /// Waits in the queue and plans.
@@ -165,7 +106,9 @@ impl ModelThread {
         if let Err(SendError(Job::Plan(Waiting { reply, .. }))) = self.jobs.send(job) {
             return reply.send(Err(stopped()));
         }
-        self.watch();
+        if self.load.replying().is_some() {
+            self.relay.watch();
+        }
     }
 
     /// The same for what is called with the answer, and may block.
@@ -190,7 +133,7 @@ impl ModelThread {
             let before = self.load.replying();
             match tokio::time::timeout(PATIENCE, &mut done).await {
                 Ok(answer) => return answer.map_err(|_| stopped())?,
-                Err(_) => before.into_iter().for_each(|reply| self.take_over(reply)),
+                Err(_) => before.into_iter().for_each(|reply| self.relay.take_over(reply)),
             }
         }
     }
@@ -254,32 +197,8 @@ impl ModelThread {
                 match tokio::time::timeout(PATIENCE, models.changed()).await {
                     Ok(Ok(())) => {}
                     Ok(Err(_)) => return,
-                    Err(_) => before.into_iter().for_each(|reply| self.take_over(reply)),
+                    Err(_) => before.into_iter().for_each(|reply| self.relay.take_over(reply)),
                 }
-            }
-        }
-    }
-}
-
-/// Owns the models until there is nothing more to do, or another thread has taken over. What may block is sent from here, without
-/// the models: another thread would have to be woken. If it does block, because its client does not read, another thread takes over
-/// the models and what is to be sent after it.
-fn work(lead: &Mutex<Option<Lead>>, load: &Load) {
-    let lock = || lead.lock().unwrap_or_else(PoisonError::into_inner);
-    let mut owned = lock();
-    while let Some(Lead { owner, jobs }) = owned.as_mut() {
-        match owner.step(jobs) {
-            Step::Next => {}
-            Step::End => *owned = None,
-            Step::Reply(reply, answer) if load.has_stuck() => reply.send(answer),
-            Step::Reply(reply, answer) => {
-                let number = load.begin_reply();
-                drop(owned);
-                reply.send_here(answer);
-                if !load.end_reply(number) {
-                    return;
-                }
-                owned = lock();
             }
         }
     }
@@ -288,5 +207,95 @@ fn work(lead: &Mutex<Option<Lead>>, load: &Load) {
 impl fmt::Debug for Lead {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Lead")
+    }
+}
+
+/// The models, as they go from thread to thread.
+#[derive(Debug, Clone)]
+struct Relay {
+    lead: Arc<Mutex<Option<Lead>>>,
+    load: Arc<Load>,
+    threads: u16,
+    runtime: Handle,
+    is_watched: Arc<AtomicBool>,
+}
+
+impl Relay {
+    /// Starts a thread that owns the models, if `takes_over` says so there.
+    fn spawn(&self, takes_over: impl FnOnce(&Load) -> bool + Send + 'static) -> io::Result<()> {
+        let this = self.clone();
+        thread::Builder::new().name("model".into()).spawn(move || {
+            tch::set_num_threads(this.threads.into());
+            if takes_over(&this.load) {
+                this.work();
+            }
+        })?;
+        Ok(())
+    }
+
+    /// Owns the models until there is nothing more to do, or another thread has taken over. What may block is sent from here, without
+    /// the models: another thread would have to be woken. If it does block, because its client does not read, another thread takes over
+    /// the models and what is to be sent after it.
+    fn work(&self) {
+        let load = &*self.load;
+        let lock = || self.lead.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut owned = lock();
+        while let Some(Lead { owner, jobs }) = owned.as_mut() {
+            match owner.step(jobs) {
+                Step::Next => {}
+                Step::End => *owned = None,
+                Step::Reply(reply, answer) if load.has_stuck() => reply.send(answer),
+                Step::Reply(reply, answer) => {
+                    let number = load.begin_reply();
+                    // Who comes from now on sees it, and has it watched.
+                    if load.tasks() > 0 || owner.has_outgoing() {
+                        self.watch();
+                    }
+                    drop(owned);
+                    reply.send_here(answer);
+                    if !load.end_reply(number) {
+                        return;
+                    }
+                    owned = lock();
+                }
+            }
+        }
+    }
+
+    /// Sees to it that nobody waits for an answer to another to be sent, as long as there is anything to be done.
+    fn watch(&self) {
+        if self.is_watched.swap(true, Ordering::SeqCst) {
+            return;
+        }
+        let this = self.clone();
+        self.runtime.spawn(async move {
+            let mut before = None;
+            loop {
+                tokio::time::sleep(PATIENCE).await;
+                let reply = this.load.replying();
+                if let Some(reply) = reply.filter(|_| reply == before) {
+                    this.take_over(reply);
+                }
+                before = reply;
+                let nothing_to_watch = || this.load.tasks() == 0 && this.load.replying().is_none();
+                if nothing_to_watch() {
+                    this.is_watched.store(false, Ordering::SeqCst);
+                    // Who has come in the meantime is seen here, or sees that nobody watches.
+                    if nothing_to_watch() || this.is_watched.swap(true, Ordering::SeqCst) {
+                        return;
+                    }
+                }
+            }
+        });
+    }
+
+    /// Lets another thread own the models, if this answer is still being sent.
+    fn take_over(&self, reply: u64) {
+        if self.load.replying() != Some(reply) {
+            return;
+        }
+        if let Err(error) = self.spawn(move |load| load.take_over(reply)) {
+            warn!(%error, "an answer is not read; those who wait do so until it is given up");
+        }
     }
 }

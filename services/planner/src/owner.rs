@@ -110,6 +110,11 @@ impl Owner {
         Step::Next
     }
 
+    /// Whether there is more to be sent.
+    pub(crate) fn has_outgoing(&self) -> bool {
+        !self.outgoing.is_empty()
+    }
+
     fn serve(&mut self, model: Model) -> Result<(), Error> {
         let (info, costs) = (model.info.clone(), model.costs.clone());
         self.models.swap_in(model)?;
