@@ -11,6 +11,8 @@ use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
 const LISTEN: &str = "tls/0.0.0.0:7447";
 /// Most connections of a router at the same time.
 const MAX_SESSIONS: usize = 1000;
+/// Batches of messages, each of 64 KiB at most, that wait for a link: the most that zenoh allows.
+const QUEUE_BATCHES: usize = 16;
 /// Most frames, or actions, that a worker shows in a second.
 const FRAMES_PER_SECOND: f64 = 200.0;
 /// Room for what is sent beside a payload.
@@ -53,6 +55,8 @@ pub fn config(folder: &Path, identities: &Identities) -> anyhow::Result<Value> {
             "link": {
                 "protocols": ["tls"],
                 "rx": { "max_message_size": wire_max_bytes() },
+                // On one thread, which TLS links are kept to, a full queue is emptied only after whoever fills it has given up.
+                "tx": { "queue": { "size": { "data": QUEUE_BATCHES, "data_low": QUEUE_BATCHES } } },
                 "tls": {
                     "root_ca_certificate": file("ca.pem"),
                     "listen_certificate": file("certificate.pem"),

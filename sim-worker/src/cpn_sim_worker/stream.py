@@ -74,7 +74,8 @@ def send_episode(
                 keys.demonstration_step(episode.episode_id, number),
                 steps[number].SerializeToString(),
                 encoding=encoding(demonstration_pb2.DemonstrationStep),
-                congestion_control=zenoh.CongestionControl.BLOCK,
+                # A commit tells which steps are missing, and they are sent again: a router never has to wait for them.
+                congestion_control=zenoh.CongestionControl.DROP,
             )
 
     # The pauses grow, so that a trainer that is still busy with what was sent is not sent ever more.
