@@ -45,8 +45,9 @@ pub(crate) const CHANGES: Changes = Changes {
     ],
 };
 
-/// How long requests in flight may take to finish at shutdown.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long requests in flight may take to finish at shutdown: with the rest of it, less than the ten seconds that orchestrators
+/// give.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(7);
 
 /// A planner that runs.
 #[derive(Debug)]
@@ -108,7 +109,7 @@ impl Planner {
         self.core.clone()
     }
 
-    /// Takes no more requests, lets those in flight finish within ten seconds, and leaves the network.
+    /// Takes no more requests, lets those in flight finish within seven seconds, and leaves the network.
     ///
     /// # Errors
     /// If gRPC had failed before, or zenoh does not close.
