@@ -55,7 +55,8 @@ pub async fn send(session: &Session, episode: &Episode) -> Result<(), Error> {
         }
         for step in episode.steps().iter().filter(|step| missing.contains(&step.step)) {
             let key = key::demonstration_step(&step.episode_id, &step.step.to_string())?;
-            let put = session.put(key, encode(step.clone())).congestion_control(CongestionControl::Block);
+            // The commit tells which steps are missing, and they are sent again: a router never has to wait for them.
+            let put = session.put(key, encode(step.clone())).congestion_control(CongestionControl::Drop);
             put.await.map_err(|e| Error::new(Code::Unavailable, "transport", "a step sent", e))?;
         }
         match commit(session, episode).await?.len() {
