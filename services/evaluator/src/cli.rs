@@ -65,7 +65,8 @@ pub struct RunArgs {
     /// Time in which a lost router, planner or worker may come back for a trial to go on; after it the trial begins anew.
     #[arg(long, default_value_t = 30, value_parser = value_parser!(u64).range(..=3600))]
     pub recovery_secs: u64,
-    /// Limit of the wait for router, planners and workers, at the start and whenever no planner or no worker is left.
+    /// Limit of the wait for router, planners and workers, and for planners to serve the same models, at the start and whenever no
+    /// planner or no worker is left.
     #[arg(long, default_value_t = 60, value_parser = value_parser!(u64).range(1..=86_400))]
     pub wait_secs: u64,
     /// Connection to the planners and the workers.

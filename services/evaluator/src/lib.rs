@@ -42,6 +42,9 @@ use wire::key;
 use wire::planner::{ListModelsRequest, ListModelsResponse, ModelInfo};
 use zenoh::Session;
 
+/// Pause before planners whose models differ are asked again.
+const MODELS_PERIOD: Duration = Duration::from_secs(1);
+
 /// Runs what is missing of an evaluation, and reports.
 ///
 /// # Errors
@@ -115,7 +118,8 @@ pub fn report(out: &Path) -> anyhow::Result<Summary> {
     Ok(summary)
 }
 
-/// The named models, or all of the first planner if none is named, as every planner serves them.
+/// The named models, or all of the first planner if none is named, as every planner serves them. Waits while planners differ:
+/// one may still be fetching a checkpoint that was published a moment ago.
 async fn models(
     session: &Session,
     planners: &[String],
@@ -123,30 +127,46 @@ async fn models(
     timeout: Duration,
     patience: Duration,
 ) -> anyhow::Result<Vec<Model>> {
-    let mut models: Option<(&String, Vec<Model>)> = None;
-    for planner in planners {
-        let key = key::planner_list_models(planner)?;
-        // Right after connecting, the services of a planner that is alive may not be known yet.
-        let response: ListModelsResponse = link::ask(session, &key, ListModelsRequest, timeout, patience)
-            .await
-            .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
-        match &models {
-            None => models = Some((planner, selected(planner, response.models, names)?)),
-            Some((first, expected)) => check_same(first, expected, planner, &response.models)?,
+    let start = Instant::now();
+    loop {
+        let mut served = Vec::new();
+        for planner in planners {
+            let key = key::planner_list_models(planner)?;
+            // Right after connecting, the services of a planner that is alive may not be known yet.
+            let response: ListModelsResponse = link::ask(session, &key, ListModelsRequest, timeout, patience)
+                .await
+                .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
+            served.push((planner.as_str(), response.models));
         }
+        let served_by_one =
+            |name: &String| served.iter().any(|(_, models)| models.iter().any(|model| model.name == *name));
+        match same_models(&served, names) {
+            Ok(models) => return Ok(models),
+            Err(error) if start.elapsed() >= patience || !names.iter().all(served_by_one) => return Err(error),
+            Err(error) => tracing::info!("waiting up to {} s: {error:#}", patience.as_secs()),
+        }
+        tokio::time::sleep(MODELS_PERIOD).await;
     }
-    Ok(models.map(|(_, models)| models).unwrap_or_default())
+}
+
+fn same_models(served: &[(&str, Vec<ModelInfo>)], names: &[String]) -> anyhow::Result<Vec<Model>> {
+    let Some(((first, first_models), others)) = served.split_first() else { return Ok(Vec::new()) };
+    let models = selected(first, first_models, names)?;
+    for (planner, other_models) in others {
+        check_same(first, &models, planner, other_models)?;
+    }
+    Ok(models)
 }
 
 /// The named models, or all if none is named.
-fn selected(planner: &str, served: Vec<ModelInfo>, names: &[String]) -> anyhow::Result<Vec<Model>> {
+fn selected(planner: &str, served: &[ModelInfo], names: &[String]) -> anyhow::Result<Vec<Model>> {
     ensure!(!served.is_empty(), "planner \"{planner}\" serves no model");
     if names.is_empty() {
-        return Ok(served.into_iter().map(Model::from).collect());
+        return Ok(served.iter().cloned().map(Model::from).collect());
     }
     let find = |name: &String| {
         let model = served.iter().find(|model| model.name == *name).cloned().map(Model::from);
-        model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", listed(&served)))
+        model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", listed(served)))
     };
     names.iter().map(find).collect()
 }

@@ -18,7 +18,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 use tokio::process::Command;
 use tokio::time::{sleep, timeout};
-use wire::planner::{PlanRequest, PlanResponse};
+use wire::planner::{CheckpointSource, LoadModelRequest, PlanRequest, PlanResponse};
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse};
 use wire::{Code, Error, Image, key, query};
 use zenoh::Session;
@@ -285,7 +285,7 @@ async fn results_through_outages_are_those_without() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn planners_that_differ_are_refused_and_a_router_is_waited_for() {
+async fn a_router_and_planners_that_differ_are_waited_for() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
     let endpoint = common::free_endpoint();
@@ -300,16 +300,35 @@ async fn planners_that_differ_are_refused_and_a_router_is_waited_for() {
         common::models(&names[seed as usize], seed)
     });
     let mut waits = evaluation(&endpoint, &arguments);
-    let waits = waits.args(["--wait-secs", "120", "--models", "cpn"]).spawn().unwrap();
+    let waits = waits.args(["--wait-secs", "120", "--models", "cpn", "--trials", "1"]).spawn().unwrap();
     let the_router = router(&endpoint).await;
     let _worker = worker(&endpoint, "w0").await;
     let planners =
         [planner(&endpoint, &models[0], "planner-0").await, planner(&endpoint, &models[1], "planner-1").await];
-    let ended = Ended::of(waits.wait_with_output()).await;
+    let elsewhere = folder.path().join("elsewhere");
+    let arguments = ["--planner", "planner-0,planner-1", "--out", elsewhere.to_str().unwrap()];
+    let refused =
+        |models| Ended::of(evaluation(&endpoint, &arguments).args(["--wait-secs", "3", "--models", models]).output());
+    let ended = refused("cpn").await;
     assert!(!ended.success);
     let expected = "--planner: expected planner \"planner-1\" to serve cpn from checkpoint ";
     assert!(ended.stderr.contains(expected), "{}", ended.stderr);
     assert!(ended.stderr.contains("as planner \"planner-0\" does, got "), "{}", ended.stderr);
+    let ended = refused("nobodys").await;
+    assert!(ended.stderr.contains("serves cpn, jenga, random; got nobodys"), "{}", ended.stderr);
+    assert!(
+        !ended.stderr.contains("waiting up to 3 s: --"),
+        "a name that nobody serves is not waited for: {}",
+        ended.stderr
+    );
+
+    std::fs::copy(models[0].join("cpn.safetensors"), models[1].join("cpn-of-0.safetensors")).unwrap();
+    let source = CheckpointSource::File("cpn-of-0.safetensors".into());
+    let load = LoadModelRequest { model: "cpn".into(), source };
+    planners[1].core().load_model(load).await.unwrap();
+    let ended = Ended::of(waits.wait_with_output()).await;
+    assert!(ended.success, "{}", ended.stderr);
+    assert!(ended.stderr.contains(&format!("waiting up to 120 s: {expected}")), "{}", ended.stderr);
     for planner in planners {
         planner.shutdown().await.unwrap();
     }
