@@ -54,7 +54,10 @@ pip_configuration() {
 }
 
 make_debian() {
-  command -v debootstrap >/dev/null || { echo "debootstrap is missing: apt-get install debootstrap" >&2; exit 1; }
+  if ! command -v debootstrap >/dev/null; then
+    "${sudo[@]}" apt-get update -qq
+    "${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends debootstrap
+  fi
   local root=$work/debian sources
   sources=$(apt_sources)
   "${sudo[@]}" debootstrap --variant=minbase --include=ca-certificates bookworm "$root" \
