@@ -51,6 +51,7 @@ class Stack:
         self._command = [*engine.compose_command(), "--project-name", self.project, "--project-directory", str(ROOT)]
         self.environment = dict(os.environ) | {name: str(port) for name, port in self.ports.items()}
         self.environment["RUST_LOG"] = "info"
+        self.environment["CPN_HOSTS"] = "router,planner-0,planner-1,trainer,host-a,host-b"
         self._further: list[str] = []
 
     def compose(self, *arguments: str, further_file: Path | None = None) -> str:
@@ -157,16 +158,27 @@ class Stack:
         arguments += [f"--tasks={tasks}", f"--trials={trials}", "--wait-secs=120", f"--out={out}/{name}"]
         return Evaluation(self.run("evaluator", *arguments, options=options), f"{out}/{name}")
 
-    def certificates(self, role: str, folder: Path) -> Path:
-        """Copies the certificates of a role out of their volume."""
-        volume = f"{self.project}_certificates-{role}"
-        name = docker("create", "--volume", f"{volume}:/certificates:ro", "cpn-certs")
+    @contextmanager
+    def _certificates(self, role: str) -> Iterator[str]:
+        """A container, which never runs, with the certificates of a role at /certificates."""
+        name = docker("create", "--volume", f"{self.project}_certificates-{role}:/certificates", "cpn-certs")
         try:
-            for file, content in engine.read_folder(name, "/certificates").items():
-                (folder / file).write_bytes(content)
+            yield name
         finally:
             docker("rm", name)
+
+    def certificates(self, role: str, folder: Path) -> Path:
+        """Copies the certificates of a role out of their volume."""
+        with self._certificates(role) as container:
+            for file, content in engine.read_folder(container, "/certificates").items():
+                (folder / file).write_bytes(content)
         return folder
+
+    def copy_certificates(self, role: str, other: "Stack") -> None:
+        """Copies the certificates of a role into the volume of another stack."""
+        with self._certificates(role) as mine, other._certificates(role) as theirs:
+            for file, content in engine.read_folder(mine, "/certificates").items():
+                engine.write_file(theirs, "/certificates", file, content, USER)
 
     def logs(self, service: str) -> str:
         """What the first container of a service wrote."""
