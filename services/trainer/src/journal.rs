@@ -2,6 +2,7 @@
 
 use crate::curve;
 use crate::progress::{Observer, Progress, ends_epoch};
+use crate::tensorboard::EventWriter;
 use crate::train;
 use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
@@ -12,10 +13,6 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
-use tfrecord::protobuf::event::What;
-use tfrecord::protobuf::session_log::SessionStatus;
-use tfrecord::protobuf::{Event, SessionLog};
-use tfrecord::{EventMeta, EventWriter};
 
 /// Most steps of a run that are noted, besides the last of each epoch.
 const MAX_NOTED: u64 = 1000;
@@ -148,11 +145,7 @@ fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<
     old.retain(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(EVENTS)));
     // The name grows, so that a TensorBoard that is open goes on to this file.
     let path = folder.join(format!("{EVENTS}{:.6}.{}", unix_seconds(), std::process::id()));
-    let mut events = EventWriter::from_writer(File::create_new(&path)?, Default::default())?;
-    events.write_event(event(What::FileVersion("brain.Event:2".into())))?;
-    // It forgets then what it has read of the old ones.
-    let start = SessionLog { status: SessionStatus::Start.into(), ..Default::default() };
-    events.write_event(event(What::SessionLog(start)))?;
+    let mut events = EventWriter::new(File::create_new(&path)?, unix_seconds())?;
     for entry in entries {
         write_events(&mut events, entry)?;
     }
@@ -162,22 +155,15 @@ fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<
     Ok(events)
 }
 
-fn event(what: What) -> Event {
-    Event { what: Some(what), ..EventMeta::new(0, unix_seconds()).build_empty() }
-}
-
 fn write_events(events: &mut EventWriter<File>, entry: &Entry) -> anyhow::Result<()> {
     let Progress { step, loss, learning_rate, gradient_norm, samples_per_second, .. } = entry.progress;
-    let meta = EventMeta::new(i64::try_from(step)?, entry.unix_seconds);
-    for (tag, value) in [
-        ("train/loss", loss),
-        ("train/learning_rate", learning_rate),
-        ("train/gradient_norm", gradient_norm),
-        ("train/samples_per_second", samples_per_second),
-    ] {
-        events.write_scalar(tag, meta.clone(), value as f32)?;
-    }
-    Ok(())
+    let scalars = [
+        ("train/loss", loss as f32),
+        ("train/learning_rate", learning_rate as f32),
+        ("train/gradient_norm", gradient_norm as f32),
+        ("train/samples_per_second", samples_per_second as f32),
+    ];
+    Ok(events.write_scalars(i64::try_from(step)?, entry.unix_seconds, &scalars)?)
 }
 
 fn unix_seconds() -> f64 {

@@ -35,6 +35,7 @@ mod runs_zenoh;
 pub mod sampler;
 pub mod service;
 mod signature;
+pub mod tensorboard;
 pub mod train;
 pub mod verify;
 pub mod versions;

@@ -13,6 +13,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 use trainer::journal::{self, Entry};
 use trainer::progress::Progress;
+use trainer::tensorboard::{self, Content};
 
 /// Steps of a pass: 21 samples in batches of 2.
 const STEPS_PER_EPOCH: u64 = 11;
@@ -88,16 +89,11 @@ impl Run {
         let mut files = files.iter().filter(|path| path.to_string_lossy().contains("tfevents"));
         let file = files.next().unwrap();
         assert_eq!(files.next(), None, "one event file");
-        let reader = tfrecord::EventIter::open(file, Default::default()).unwrap();
         let mut scalars = Vec::new();
-        for event in reader.map(Result::unwrap) {
-            let Some(tfrecord::protobuf::event::What::Summary(summary)) = event.what else { continue };
-            for value in summary.value {
-                let Some(tfrecord::protobuf::summary::value::Value::SimpleValue(scalar)) = value.value else {
-                    panic!()
-                };
-                scalars.push((u64::try_from(event.step).unwrap(), value.tag, scalar));
-            }
+        for event in tensorboard::read(&std::fs::read(file).unwrap()) {
+            let Some(Content::Summary(summary)) = event.content else { continue };
+            let step = u64::try_from(event.step).unwrap();
+            scalars.extend(summary.values.into_iter().map(|scalar| (step, scalar.tag, scalar.value.unwrap())));
         }
         scalars
     }
