@@ -77,9 +77,9 @@ async fn fetch(session: &Session, manifest: &CheckpointManifest) -> Result<Vec<u
     Ok(bytes)
 }
 
-/// When to ask for a piece again: right after a reconnect a query can end without an answer.
+/// When to ask for a piece again: right after a reconnect a query can end without an answer, and many planners may ask at once.
 fn again() -> ConstantBuilder {
-    ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(2)
+    ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(4)
 }
 
 async fn fetch_chunk(
@@ -88,7 +88,9 @@ async fn fetch_chunk(
     request: &CheckpointChunkRequest,
 ) -> Result<Vec<u8>, Error> {
     let ask = || query::call(session, key, request.clone(), CHUNK_TIMEOUT);
-    let answer: CheckpointChunkResponse =
-        ask.retry(again()).when(|error: &Error| error.code == Code::Unavailable).await?;
+    let answer: CheckpointChunkResponse = ask
+        .retry(again())
+        .when(|error: &Error| matches!(error.code, Code::Unavailable | Code::ResourceExhausted))
+        .await?;
     Ok(answer.data)
 }

@@ -10,6 +10,7 @@ use wire::training::{
 };
 use wire::{Code, Error, Message, key, query};
 use zenoh::Session;
+use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
 
 /// How long an answer may take; a run that is stopped may take half a minute to end.
@@ -50,8 +51,9 @@ pub async fn list(session: &Session, trainer: &str) -> Result<Vec<Run>, Error> {
 /// # Errors
 /// If there is no such run, the trainer goes away, or what is published is not the run's progress.
 pub async fn watch(session: &Session, trainer: &str, name: &str) -> anyhow::Result<Run> {
-    // What changes after the run was asked for is heard, as it is listened for already.
-    let published = session.declare_subscriber(key::training_progress(name)?).await.map_err(|e| anyhow!(e))?;
+    // What changes after the run was asked for is heard, as it is listened for already. Only the latest is of interest.
+    let published = session.declare_subscriber(key::training_progress(name)?).with(RingChannel::new(1));
+    let published = published.await.map_err(|e| anyhow!(e))?;
     let mut run = get(session, trainer, name).await?;
     let mut bar = Bar::new(name);
     bar.begin(run.progress.map_or(0, |progress| progress.step))?;

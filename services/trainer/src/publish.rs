@@ -1,6 +1,7 @@
 //! Publishing over zenoh: planners are told which version of each model to serve and fetch it piece by piece; people list,
 //! promote and roll back.
 
+use crate::queries;
 use crate::service::CHANGES;
 use crate::versions::Versions;
 use anyhow::anyhow;
@@ -8,7 +9,7 @@ use backon::{ConstantBuilder, Retryable};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::watch;
+use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{debug, warn};
 use wire::checkpoint::{
@@ -17,9 +18,8 @@ use wire::checkpoint::{
 };
 use wire::{Code, Error, Message, encode, key, query};
 use zenoh::Session;
-use zenoh::handlers::FifoChannelHandler;
 use zenoh::key_expr::OwnedKeyExpr;
-use zenoh::pubsub::Subscriber;
+use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 
 /// How often the folder of checkpoints is looked at.
@@ -27,64 +27,67 @@ const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// How long an answer may take.
 const TIMEOUT: Duration = Duration::from_secs(10);
 
+/// Queryables and announcements of the versions; they stop when this is dropped.
+#[derive(Debug)]
+pub(crate) struct Publisher {
+    _queryables: [Queryable<()>; 4],
+    /// They never end but with the reason why they cannot go on.
+    pub(crate) tasks: JoinSet<anyhow::Result<()>>,
+}
+
 /// Announces the promoted version of every model to every planner, those to come included, and answers what is asked of
-/// the versions; when this returns, it does. The tasks end with the session, or with the reason why they cannot go on.
+/// the versions; when this returns, it does.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
-pub async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Result<JoinSet<anyhow::Result<()>>> {
+pub(crate) async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Result<Publisher> {
+    let queryables = [
+        serve(session, key::checkpoint_chunk("*")?, None, versions, Versions::chunk).await?,
+        serve(session, key::checkpoint_list_versions("*")?, None, versions, Versions::list).await?,
+        serve(session, key::checkpoint_promote("*")?, Some("promote"), versions, Versions::promote).await?,
+        serve(session, key::checkpoint_roll_back("*")?, Some("roll_back"), versions, Versions::roll_back).await?,
+    ];
     let mut tasks = JoinSet::new();
-    serve(&mut tasks, session, (key::checkpoint_chunk("*")?, None), versions, Versions::chunk).await?;
-    serve(&mut tasks, session, (key::checkpoint_list_versions("*")?, None), versions, Versions::list).await?;
-    serve(&mut tasks, session, (key::checkpoint_promote("*")?, Some("promote")), versions, Versions::promote).await?;
-    let roll_back = (key::checkpoint_roll_back("*")?, Some("roll_back"));
-    serve(&mut tasks, session, roll_back, versions, Versions::roll_back).await?;
-    let planners = session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true);
-    let planners = planners.await.map_err(|e| anyhow!(e))?;
-    tasks.spawn(announce(session.clone(), planners, Arc::clone(versions)));
+    tasks.spawn(announce(session.clone(), Arc::clone(versions)));
     tasks.spawn(take_in(Arc::clone(versions)));
-    Ok(tasks)
+    Ok(Publisher { _queryables: queryables, tasks })
 }
 
-/// Answers a queryable's requests, which may be for a change, one after the other, where they may block.
+/// Answers a queryable's requests, which may be for a change.
 async fn serve<Q, R>(
-    tasks: &mut JoinSet<anyhow::Result<()>>,
     session: &Session,
-    (key, change): (OwnedKeyExpr, Option<&'static str>),
+    key: OwnedKeyExpr,
+    change: Option<&'static str>,
     versions: &Arc<Versions>,
     answer: fn(&Versions, Q) -> Result<R, Error>,
-) -> anyhow::Result<()>
+) -> anyhow::Result<Queryable<()>>
 where
     Q: Message + 'static,
     R: Message + 'static,
 {
-    let queries = session.declare_queryable(key).complete(true).await.map_err(|e| anyhow!(e))?;
     let versions = Arc::clone(versions);
-    tasks.spawn(async move {
-        while let Ok(query) = queries.recv_async().await {
-            let versions = Arc::clone(&versions);
-            let answering = tokio::task::spawn_blocking(move || {
-                let result = query::request(&query).and_then(|request| answer(&versions, request));
-                if let (Some(change), Err(error)) = (change, &result) {
-                    CHANGES.refused(change, query.key_expr(), error);
-                }
-                if let Err(error) = query::reply(&query, result) {
-                    warn!(%error, key = %query.key_expr(), "answer not sent");
-                }
-            });
-            answering.await?;
+    let answer = move |query: &Query| {
+        let result = query::request(query).and_then(|request| answer(&versions, request));
+        if let (Some(change), Err(error)) = (change, &result) {
+            CHANGES.refused(change, query.key_expr(), error);
         }
-        Ok(())
-    });
-    Ok(())
+        query::reply(query, result)
+    };
+    queries::serve(session, key, true, answer).await.map_err(|e| anyhow!(e))
 }
 
 /// Tells planners what is promoted, whenever that changes or one of them appears. They pass over what they know.
-async fn announce(
-    session: Session,
-    planners: Subscriber<FifoChannelHandler<Sample>>,
-    versions: Arc<Versions>,
-) -> anyhow::Result<()> {
+async fn announce(session: Session, versions: Arc<Versions>) -> anyhow::Result<()> {
+    let appeared = Arc::new(Notify::new());
+    let notify = Arc::clone(&appeared);
+    let on_token = move |token: Sample| {
+        if token.kind() == SampleKind::Put {
+            notify.notify_one();
+        }
+    };
+    let planners = session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true);
+    let _planners = planners.callback(on_token).await.map_err(|e| anyhow!(e))?;
+
     let mut promoted = versions.promoted();
     loop {
         let announcements: Vec<_> = promoted.borrow_and_update().values().cloned().collect();
@@ -94,22 +97,9 @@ async fn announce(
             let key = key::checkpoint_announcement(model)?;
             session.put(key, encode(announcement)).await.map_err(|e| anyhow!(e))?;
         }
-        if !news(&mut promoted, &planners).await {
-            return Ok(());
-        }
-    }
-}
-
-/// Waits for another promotion or another planner; false once the session is closed.
-async fn news<T>(promoted: &mut watch::Receiver<T>, planners: &Subscriber<FifoChannelHandler<Sample>>) -> bool {
-    loop {
         tokio::select! {
-            changed = promoted.changed() => return changed.is_ok(),
-            token = planners.recv_async() => match token.map(|token| token.kind()) {
-                Ok(SampleKind::Put) => return true,
-                Ok(SampleKind::Delete) => {}
-                Err(_) => return false,
-            },
+            changed = promoted.changed() => changed?,
+            () = appeared.notified() => {}
         }
     }
 }

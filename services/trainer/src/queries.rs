@@ -12,11 +12,12 @@ use zenoh::query::{Query, Queryable};
 /// Queries of one kind that are answered or wait for it at the same time; each holds an episode at most.
 const PLACES: usize = 16;
 
-/// Answers queries on threads that may read and write files; zenoh's callback only starts them. Services hold
-/// different things, so none is complete.
+/// Answers queries on threads that may read and write files; zenoh's callback only starts them. A `complete` queryable
+/// answers for all others of its keys.
 pub(crate) async fn serve(
     session: &Session,
     key: OwnedKeyExpr,
+    complete: bool,
     answer: impl Fn(&Query) -> zenoh::Result<()> + Send + Sync + 'static,
 ) -> zenoh::Result<Queryable<()>> {
     let (places, runtime, answer) = (Arc::new(Semaphore::new(PLACES)), Handle::current(), Arc::new(answer));
@@ -35,5 +36,5 @@ pub(crate) async fn serve(
             }
         });
     };
-    session.declare_queryable(key).callback(callback).await
+    session.declare_queryable(key).complete(complete).callback(callback).await
 }

@@ -24,8 +24,8 @@ pub struct Recorder {
 /// If zenoh refuses a declaration.
 pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<Ingest>) -> zenoh::Result<Recorder> {
     let (listed, read) = (Arc::clone(&recordings), recordings);
-    let list = serve(session, key::demonstration_recorded("*")?, move |query| list(&listed, query)).await?;
-    let send = serve(session, key::demonstration_step("*", "*")?, move |query| send(&read, query)).await?;
+    let list = serve(session, key::demonstration_recorded("*")?, false, move |query| list(&listed, query)).await?;
+    let send = serve(session, key::demonstration_step("*", "*")?, false, move |query| send(&read, query)).await?;
     let receiver = Arc::clone(&ingest);
     // The callback only copies a frame. It must be done before the next message is read: a commit follows its steps.
     let steps = session
@@ -37,7 +37,7 @@ pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<I
         .await?;
     let announcer = session.clone();
     let commit =
-        serve(session, key::demonstration_commit("*")?, move |query| commit(&announcer, &ingest, query)).await?;
+        serve(session, key::demonstration_commit("*")?, false, move |query| commit(&announcer, &ingest, query)).await?;
     Ok(Recorder { _steps: steps, _queryables: [list, send, commit] })
 }
 

@@ -11,7 +11,7 @@ use std::path::Path;
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 use tokio::process::Command;
-use tokio_util::codec::{FramedRead, LinesCodec};
+use tokio_util::codec::{FramedRead, LinesCodec, LinesCodecError};
 use tokio_util::sync::CancellationToken;
 use tracing::warn;
 use wire::training::MAX_REASON_BYTES;
@@ -84,10 +84,19 @@ async fn attend(
     let mut lines =
         child.stdout.take().map(|out| FramedRead::new(out, LinesCodec::new_with_max_length(MAX_LINE_BYTES)));
     let ended = async {
-        let mut outcome = None;
-        while let Some(lines) = &mut lines
-            && let Some(Ok(line)) = lines.next().await
-        {
+        let (mut outcome, mut too_long) = (None, false);
+        while let Some(lines) = &mut lines {
+            let line = match lines.next().await {
+                Some(Ok(line)) => line,
+                Some(Err(LinesCodecError::MaxLineLengthExceeded)) => {
+                    warn!(max_bytes = MAX_LINE_BYTES, "line of a run passed over: it is too long");
+                    too_long = true;
+                    continue;
+                }
+                // After an error the stream pauses once.
+                None if std::mem::take(&mut too_long) => continue,
+                Some(Err(LinesCodecError::Io(_))) | None => break,
+            };
             match serde_json::from_str(&line) {
                 Ok(Line::Progress(progress)) => hear(progress),
                 Ok(Line::Outcome(said)) => outcome = Some(said),
@@ -135,4 +144,23 @@ fn reason(status: ExitStatus, log: &Path) -> String {
     let mut reason = format!("{status}\n{}", String::from_utf8_lossy(&tail).trim());
     reason.truncate(reason.floor_char_boundary(MAX_REASON_BYTES));
     reason
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::PermissionsExt;
+
+    #[tokio::test]
+    async fn a_line_that_is_too_long_is_passed_over() -> anyhow::Result<()> {
+        let folder = tempfile::tempdir()?;
+        let [program, log] = ["program", "log"].map(|name| folder.path().join(name));
+        let script =
+            "#!/bin/sh\nhead -c 200000 /dev/zero | tr '\\0' x\necho\necho '{\"finished\": {\"digest\": \"d\"}}'\n";
+        std::fs::write(&program, script)?;
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755))?;
+        let end = run(&program, Path::new("settings"), &log, &CancellationToken::new(), |_| {}).await;
+        assert!(matches!(&end, End::Finished { digest } if digest == "d"), "{end:?}");
+        Ok(())
+    }
 }

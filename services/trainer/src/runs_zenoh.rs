@@ -49,9 +49,9 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
         query::reply_as(query, &own, answer)
     };
     let queryables = [
-        serve(session, start_key, start).await.map_err(zenoh)?,
-        serve(session, stop_key, stop).await.map_err(zenoh)?,
-        serve(session, list_key, list).await.map_err(zenoh)?,
+        serve(session, start_key, false, start).await.map_err(zenoh)?,
+        serve(session, stop_key, false, stop).await.map_err(zenoh)?,
+        serve(session, list_key, false, list).await.map_err(zenoh)?,
     ];
     let publisher = AbortOnDropHandle::new(tokio::spawn(publish(session.clone(), runs.clone())));
     Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
