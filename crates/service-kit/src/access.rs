@@ -1,7 +1,7 @@
 //! Telling clients apart: by their certificates, or by bearer tokens.
 
 use crate::files;
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use metrics::counter;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -77,11 +77,9 @@ impl Access {
         let required = tls || tokens.is_some();
         let Some(file) = tokens else { return Ok(Self { required, tokens: Arc::default() }) };
         let read = || {
-            let bytes = files::read_at_most(file, MAX_BYTES + 1)?;
-            ensure!(bytes.len() <= MAX_BYTES, "expected at most {MAX_BYTES} bytes, got more");
-            let TokenFile { tokens } = serde_json::from_slice(&bytes)?;
+            let TokenFile { tokens } = serde_json::from_slice(&files::read_all(file, MAX_BYTES)?)?;
             let tokens: HashMap<_, _> = tokens.into_iter().map(|entry| (entry.sha256, entry.identity)).collect();
-            Ok(tokens)
+            anyhow::Ok(tokens)
         };
         let tokens = read().with_context(|| format!("tokens {}", file.display()))?;
         Ok(Self { required, tokens: Arc::new(tokens) })

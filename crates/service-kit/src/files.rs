@@ -97,6 +97,18 @@ pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// All bytes of a regular file.
+///
+/// # Errors
+/// If it cannot be read, is no regular file, or has more than so many bytes.
+pub fn read_all(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
+    let bytes = read_at_most(path, max_bytes + 1)?;
+    if bytes.len() > max_bytes {
+        return Err(std::io::Error::other(format!("expected at most {max_bytes} bytes, got more")));
+    }
+    Ok(bytes)
+}
+
 /// The same of a file of this name in a folder: never of one elsewhere, to which a symbolic link leads.
 ///
 /// # Errors

@@ -2,7 +2,8 @@
 //!
 //! A router's access control, and the checks of gRPC, openpi and metrics, are made from it.
 
-use crate::planner::{LoadModelRequest, PlanRequest};
+use crate::checkpoint::ListVersionsResponse;
+use crate::planner::{ListModelsResponse, LoadModelRequest, PlanRequest};
 use crate::training::ListRunsResponse;
 use crate::{Error, Message, key};
 use std::fmt;
@@ -118,12 +119,15 @@ const PLANS: &[Role] = &[Evaluator, Client, Operator];
 pub const ENDPOINTS: &[Endpoint] = &[
     query(|| key::planner_plan("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/Plan"),
     query(|| key::planner_register_goal("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/RegisterGoal"),
-    query(
-        || key::planner_list_models("*"),
-        &[Planner],
-        &[Evaluator, Client, Operator, Viewer],
-        "/cpn.v1.PlannerService/ListModels",
-    ),
+    Endpoint {
+        max_bytes: ListModelsResponse::MAX_BYTES,
+        ..query(
+            || key::planner_list_models("*"),
+            &[Planner],
+            &[Evaluator, Client, Operator, Viewer],
+            "/cpn.v1.PlannerService/ListModels",
+        )
+    },
     Endpoint {
         max_bytes: LoadModelRequest::MAX_BYTES,
         ..query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel")
@@ -141,7 +145,10 @@ pub const ENDPOINTS: &[Endpoint] = &[
     zenoh(Kind::Query, || key::demonstration_recorded("*"), &[Trainer], &[Worker, Trainer, Viewer]),
     zenoh(Kind::Publication, || key::checkpoint_announcement("*"), &[Trainer], &[Planner, Viewer]),
     zenoh(Kind::Query, || key::checkpoint_chunk("*"), &[Trainer], &[Planner, Operator]),
-    zenoh(Kind::Query, || key::checkpoint_list_versions("*"), &[Trainer], &[Operator, Viewer]),
+    Endpoint {
+        max_bytes: ListVersionsResponse::MAX_BYTES,
+        ..zenoh(Kind::Query, || key::checkpoint_list_versions("*"), &[Trainer], &[Operator, Viewer])
+    },
     zenoh(Kind::Query, || key::checkpoint_promote("*"), &[Trainer], &[Operator]),
     zenoh(Kind::Query, || key::checkpoint_roll_back("*"), &[Trainer], &[Operator]),
     query(|| key::trainer_start_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StartRun"),

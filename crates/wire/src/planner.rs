@@ -438,6 +438,7 @@ impl From<ListModelsRequest> for proto::ListModelsRequest {
 
 impl Message for ListModelsResponse {
     type Proto = proto::ListModelsResponse;
+    const MAX_BYTES: usize = 16 << 20;
 }
 
 impl TryFrom<proto::ListModelsResponse> for ListModelsResponse {

@@ -57,7 +57,7 @@ impl Authority {
             files::write_atomically(&ca, certificate.as_bytes())?;
         }
         let read = |path: &Path| {
-            let bytes = files::read_at_most(path, MAX_BYTES).with_context(|| path.display().to_string())?;
+            let bytes = files::read_all(path, MAX_BYTES).with_context(|| path.display().to_string())?;
             String::from_utf8(bytes).with_context(|| path.display().to_string())
         };
         let key_pair = KeyPair::from_pem(&read(&key)?).with_context(|| key.display().to_string())?;

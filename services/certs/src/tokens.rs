@@ -9,7 +9,7 @@ use wire::access::Role;
 
 /// Name of the files of tokens.
 const TOKENS: &str = "tokens.json";
-/// Largest file of tokens.
+/// Largest file of tokens, as for the services that read it.
 const MAX_BYTES: usize = 1 << 20;
 
 impl Authority {
@@ -58,12 +58,14 @@ impl Authority {
         if !list.exists() {
             return Ok(TokenFile::default());
         }
-        let bytes = files::read_at_most(&list, MAX_BYTES).with_context(|| list.display().to_string())?;
+        let bytes = files::read_all(&list, MAX_BYTES).with_context(|| list.display().to_string())?;
         serde_json::from_slice(&bytes).with_context(|| list.display().to_string())
     }
 
     fn write_tokens(&self, file: &TokenFile) -> anyhow::Result<()> {
         let text = serde_json::to_vec_pretty(file)?;
+        let length = text.len();
+        ensure!(length <= MAX_BYTES, "tokens: expected at most {MAX_BYTES} bytes of them, got {length}; revoke some");
         files::write_secret(&self.token_list(), &text)?;
         for (identity, known) in &self.identities().identities {
             let serves = matches!(Role::of(identity), Some(Role::Planner | Role::Trainer));

@@ -131,7 +131,7 @@ class SimServer:
             queryable.undeclare()
         while not self._queue.empty():
             _, query = self._queue.get()
-            _refuse(query, types_pb2.ERROR_CODE_UNAVAILABLE, "a running worker", "one that is stopping")
+            _refuse(query, types_pb2.ERROR_CODE_UNAVAILABLE, "worker", "a running one", "one that is stopping")
 
     def _declare(self, key: str, handle: Callable[[zenoh.Query], None]) -> zenoh.Queryable[None]:
         def enqueue(query: zenoh.Query) -> None:
@@ -139,7 +139,7 @@ class SimServer:
                 self._queue.put_nowait((handle, query))
             except queue.Full:
                 expected = f"at most {QUEUE_LENGTH} waiting requests"
-                _refuse(query, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, expected, "one more")
+                _refuse(query, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, "queue", expected, "one more")
 
         return self._session.declare_queryable(key, enqueue, complete=True)
 
@@ -186,10 +186,10 @@ def _reply_error(query: zenoh.Query, error: RequestError) -> None:
     query.reply_err(error.to_proto().SerializeToString(), encoding=encoding(types_pb2.Error))
 
 
-def _refuse(query: zenoh.Query, code: types_pb2.ErrorCode, expected: str, got: str) -> None:
+def _refuse(query: zenoh.Query, code: types_pb2.ErrorCode, field: str, expected: str, got: str) -> None:
     """Answers a query that nobody will work on."""
     with query:
-        _reply_error(query, RequestError(code, "", expected, got))
+        _reply_error(query, RequestError(code, field, expected, got))
 
 
 def serve(config: ServeConfig) -> None:

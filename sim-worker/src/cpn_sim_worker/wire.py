@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 MAX_PAYLOAD_BYTES = 1 << 20
 """Far above every message of the project but a whole checkpoint, which no worker receives."""
+MAX_TEXT_BYTES = 500
+"""Longest `expected` and `got` of an error: a stranger's text may be in them."""
 
 M = TypeVar("M", bound=Message)
 
@@ -26,8 +28,8 @@ class RequestError(Exception):
         super().__init__(f"{name} {field}: expected {expected}, got {got}")
         self.code = code
         self.field = field
-        self.expected = str(expected)
-        self.got = str(got)
+        self.expected = _cut(str(expected))
+        self.got = _cut(str(got))
 
     def to_proto(self) -> types_pb2.Error:
         """The error as a message."""
@@ -37,6 +39,11 @@ class RequestError(Exception):
     def from_proto(cls, error: types_pb2.Error) -> RequestError:
         """The error that a service answered with."""
         return cls(error.code, error.field, error.expected, error.got)
+
+
+def _cut(text: str) -> str:
+    data = text.encode(errors="replace")
+    return text if len(data) <= MAX_TEXT_BYTES else data[:MAX_TEXT_BYTES].decode(errors="ignore") + "…"
 
 
 def invalid(field: str, expected: object, got: object) -> RequestError:
