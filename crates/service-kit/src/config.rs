@@ -1,16 +1,19 @@
 //! Configuration in layers: the command line over the environment over a file over the defaults.
 //!
-//! An empty environment variable counts as unset, as orchestrators fill in what nobody has set. The field decides what a text
+//! A service has one struct of settings, whose fields are options of its command line at the same time: an option's default is
+//! that of the setting. An empty environment variable counts as unset, as orchestrators fill in what nobody has set. The field decides what a text
 //! means, wherever it stands.
 
 use anyhow::bail;
 use clap::builder::Resettable;
-use clap::{Command, Parser};
+use clap::parser::ValueSource;
+use clap::{ArgMatches, Command, Parser};
 use figment::providers::{Format, Serialized, Toml};
 use figment::value::{Dict, Map, Value};
 use figment::{Figment, Metadata, Profile, Provider};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use std::ffi::{OsStr, OsString};
 use std::path::Path;
 use tracing::warn;
 
@@ -19,43 +22,106 @@ const NEAR_MISS: f64 = 0.9;
 
 /// Parses the command line; ends the process with a message if it is wrong.
 pub fn parse<A: Parser>() -> A {
-    let matches = without_empty_variables(A::command()).get_matches();
-    A::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+    parse_with_sources().0
 }
 
-/// Lets no option be read from an environment variable that is empty.
-fn without_empty_variables(command: Command) -> Command {
-    let command = command.mut_args(|arg| {
-        let empty = arg.get_env().is_some_and(|name| std::env::var_os(name).is_some_and(|value| value.is_empty()));
-        if empty { arg.env(Resettable::Reset) } else { arg }
-    });
-    command.mut_subcommands(without_empty_variables)
+/// The same, and the sources of its options.
+pub fn parse_with_sources<A: Parser>() -> (A, Sources) {
+    parse_from(std::env::args_os()).unwrap_or_else(|error| error.exit())
 }
 
-/// Reads a configuration.
+/// Parses a command line, whose first text is the program's name.
 ///
-/// `arguments` holds the options that were given, with `None` (not serialised) for the others; `prefix` starts the names of
-/// the environment variables, `CPN_PLANNER_` for example; nested fields are separated by two underscores.
+/// # Errors
+/// The message for the user.
+pub fn parse_from<A, T>(line: impl IntoIterator<Item = T>) -> Result<(A, Sources), clap::Error>
+where
+    A: Parser,
+    T: Into<OsString> + Clone,
+{
+    let is_empty = |name: &OsStr| std::env::var_os(name).is_some_and(|value| value.is_empty());
+    let mut matches = without_variables(A::command(), &is_empty).try_get_matches_from(line)?;
+    let arguments = A::from_arg_matches(&matches)?;
+    while let Some((_, of_subcommand)) = matches.remove_subcommand() {
+        matches = of_subcommand;
+    }
+    Ok((arguments, Sources(matches)))
+}
+
+/// Sources of the options of a command, or of its subcommand if there is one: the command line, an option's environment
+/// variable, its default.
+#[derive(Debug)]
+pub struct Sources(ArgMatches);
+
+impl Sources {
+    /// Those of the `settings` that were given, on the command line or in the environment variable of an option.
+    ///
+    /// # Errors
+    /// If the settings cannot be serialised.
+    fn given(&self, settings: &impl Serialize) -> serde_json::Result<serde_json::Value> {
+        let mut settings = serde_json::to_value(settings)?;
+        self.retain_given(&mut settings);
+        Ok(settings)
+    }
+
+    fn retain_given(&self, settings: &mut serde_json::Value) {
+        let Some(settings) = settings.as_object_mut() else { return };
+        settings.retain(|name, value| match self.0.ids().any(|id| id == name.as_str()) {
+            true => self.0.value_source(name) != Some(ValueSource::DefaultValue),
+            // Flattened settings are nested in a file.
+            false => {
+                self.retain_given(value);
+                value.as_object().is_some_and(|nested| !nested.is_empty())
+            }
+        });
+    }
+}
+
+/// The defaults of settings, which are those of their options.
+///
+/// # Panics
+/// If an option has no default.
+pub fn defaults<C: clap::Args>() -> C {
+    let command = without_variables(C::augment_args(Command::new("defaults")), &|_| true);
+    let defaults = command.try_get_matches_from(["defaults"]).and_then(|matches| C::from_arg_matches(&matches));
+    defaults.expect("every option has a default")
+}
+
+/// Reads from text what has a name in configuration files, for the value of an option.
+///
+/// # Errors
+/// Names what was expected.
+pub fn from_name<T: DeserializeOwned>(name: &str) -> Result<T, serde_json::Error> {
+    serde_json::from_value(name.into())
+}
+
+/// A command whose options are not read from environment variables that are to be passed over.
+fn without_variables(command: Command, passed_over: &impl Fn(&OsStr) -> bool) -> Command {
+    let command =
+        command.mut_args(|arg| if arg.get_env().is_some_and(passed_over) { arg.env(Resettable::Reset) } else { arg });
+    command.mut_subcommands(|subcommand| without_variables(subcommand, passed_over))
+}
+
+/// Reads a configuration, which is `settings` on the command line. `prefix` starts the names of the environment
+/// variables, `CPN_PLANNER_` for example; nested fields are separated by two underscores.
 ///
 /// # Errors
 /// Names the field, the file or variable it came from, what was expected and what came.
-pub fn load<C, A>(prefix: &str, file: Option<&Path>, arguments: &A) -> anyhow::Result<C>
+pub fn load<C>(prefix: &str, file: Option<&Path>, settings: &C, sources: &Sources) -> anyhow::Result<C>
 where
     C: Default + Serialize + DeserializeOwned,
-    A: Serialize,
 {
-    load_from(prefix, file, arguments, environment())
+    load_from(prefix, file, &sources.given(settings)?, environment())
 }
 
-fn load_from<C, A>(
+fn load_from<C>(
     prefix: &str,
     file: Option<&Path>,
-    arguments: &A,
+    given: &impl Serialize,
     environment: impl IntoIterator<Item = (String, String)>,
 ) -> anyhow::Result<C>
 where
     C: Default + Serialize + DeserializeOwned,
-    A: Serialize,
 {
     let defaults = serde_json::to_value(C::default())?;
     let fields: Vec<_> = defaults.as_object().into_iter().flat_map(serde_json::Map::keys).map(String::as_str).collect();
@@ -66,7 +132,7 @@ where
     for variable in variables(prefix, &fields, |_, text| value(text), environment)? {
         figment = figment.merge(variable);
     }
-    Ok(figment.merge(Serialized::defaults(arguments)).extract_lossy()?)
+    Ok(figment.merge(Serialized::defaults(given)).extract_lossy()?)
 }
 
 /// The environment, as far as it is text.

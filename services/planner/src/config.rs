@@ -1,81 +1,85 @@
-//! What the planner can be told: what was typed, and what came of it.
+//! Settings of the planner.
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use cpn::encoder::Precision;
 use serde::{Deserialize, Deserializer, Serialize};
-use service_kit::SessionConfig;
+use service_kit::{SessionConfig, config};
 use signing::Trust;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::path::PathBuf;
 
-/// Valid settings of a planner.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// Settings of a planner: options of its command line, keys of its file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Names the planner in its zenoh keys.
+    /// Name of the planner in its zenoh keys.
+    #[arg(long, default_value = "planner")]
     pub name: String,
     /// Folder of the checkpoints: each `*.safetensors` is served under its file stem from the start.
+    #[arg(long, value_name = "FOLDER", default_value = "models")]
     pub models_dir: PathBuf,
-    /// Where gRPC listens; port 0 takes a free one.
+    /// Listening address of gRPC; port 0 takes a free one.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:50051")]
     pub grpc_listen: SocketAddr,
-    /// Where clients of openpi are listened to; nowhere if none.
+    /// Listening address for clients of openpi [default: none].
+    #[arg(long, value_name = "ADDRESS")]
     pub openpi_listen: Option<SocketAddr>,
-    /// Most plan requests that wait for the model; one more is refused.
+    /// Maximum number of plan requests that wait for the model; one more is refused.
+    #[arg(long, value_name = "COUNT", default_value = "64")]
     pub queue_capacity: NonZeroU16,
-    /// Most goal images, and most embeddings of them, that are kept; the least recently used go first.
+    /// Maximum number of goal images, and of goal embeddings, kept; the least recently used are evicted.
+    #[arg(long, value_name = "COUNT", default_value = "1024")]
     pub goal_capacity: NonZeroU16,
-    /// Most models that are served, `random` among them; one more is refused.
+    /// Maximum number of models served, `random` among them; one more is refused.
+    #[arg(long, value_name = "COUNT", default_value = "32")]
     pub model_capacity: NonZeroU16,
-    /// Most checkpoints of a model that are kept after they were swapped out, for episodes that began with them; the least
-    /// recently used go first.
+    /// Maximum number of a model's checkpoints kept after they were swapped out, for episodes that began with them; the least
+    /// recently used are evicted.
+    #[arg(long, value_name = "COUNT", default_value = "3")]
     pub retired_capacity: NonZeroU16,
-    /// Most plans that are made together.
+    /// Maximum batch size.
+    #[arg(long, value_name = "COUNT", default_value = "64")]
     pub batch_size: NonZeroU16,
-    /// How long a plan waits for company, in milliseconds.
+    /// Batching delay, in milliseconds.
+    #[arg(long, value_name = "MS", default_value = "0")]
     pub batch_delay_ms: u16,
-    /// Threads that plans which are made together are spread over.
+    /// Number of threads that compute a batch.
+    #[arg(long, value_name = "COUNT", default_value = "1")]
     pub threads: NonZeroU16,
-    /// What images are embedded in: bfloat16, where the processor has instructions for it (AVX512-BF16), is faster,
-    /// and close.
+    /// Precision of the image encoder's products. bfloat16 is faster where the processor has AVX512-BF16, and float32 elsewhere.
+    #[arg(long, default_value = "float32", value_parser = named::<Precision>(&["float32", "bfloat16"]))]
     pub precision: Precision,
-    /// Policy towards checkpoints that no trusted key signed; if none is given, `warn` where there are trusted keys, else `off`.
+    /// Policy towards checkpoints without a signature by a trusted key [default: warn if there are trusted keys, else off].
+    #[arg(long, value_parser = named::<Trust>(&["off", "warn", "enforce"]))]
     pub trust: Option<Trust>,
-    /// Files of public keys, in PEM, whose signatures of checkpoints count.
+    /// Public keys, in PEM, that checkpoints may be signed with.
+    #[arg(long, value_name = "FILE", value_delimiter = ',')]
     #[serde(deserialize_with = "listed")]
     pub trusted_keys: Vec<PathBuf>,
-    /// Where Prometheus finds metrics; none are served if it is not given.
+    /// Listening address for Prometheus, for example 127.0.0.1:9465 [default: none].
+    #[arg(long, value_name = "ADDRESS")]
     pub metrics_listen: Option<SocketAddr>,
-    /// File of the tokens that clients of gRPC, openpi and metrics may bear instead of a certificate.
+    /// File of tokens that clients of gRPC, openpi and metrics may send instead of a certificate [default: none].
+    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
     pub tokens: Option<PathBuf>,
-    /// How the planner joins the others over zenoh.
+    /// Connection to the zenoh network.
+    #[command(flatten)]
     pub session: SessionConfig,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        const fn count(value: u16) -> NonZeroU16 {
-            NonZeroU16::new(value).expect("not zero")
-        }
-        Self {
-            name: "planner".into(),
-            models_dir: "models".into(),
-            grpc_listen: (Ipv4Addr::LOCALHOST, 50051).into(),
-            openpi_listen: None,
-            queue_capacity: count(64),
-            goal_capacity: count(1024),
-            model_capacity: count(32),
-            retired_capacity: count(3),
-            batch_size: count(64),
-            batch_delay_ms: 0,
-            threads: count(1),
-            precision: Precision::Float32,
-            trust: None,
-            trusted_keys: Vec::new(),
-            metrics_listen: None,
-            tokens: None,
-            session: SessionConfig::default(),
-        }
+        config::defaults()
     }
+}
+
+/// Reader of an option whose values have names.
+fn named<T>(names: &'static [&'static str]) -> impl TypedValueParser<Value = T>
+where
+    T: serde::de::DeserializeOwned + Clone + Send + Sync + 'static,
+{
+    PossibleValuesParser::new(names).try_map(|name| config::from_name(&name))
 }
 
 /// Paths in a list or, as in the environment, in one text with commas between them.
@@ -96,78 +100,13 @@ fn listed<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D:
 ///
 /// Each option is also read from the environment (CPN_PLANNER_QUEUE_CAPACITY) and from the file; the command line wins
 /// over the environment, the environment over the file.
-#[derive(Debug, clap::Parser, Serialize)]
+#[derive(Debug, clap::Parser)]
 #[command(version)]
 pub struct Args {
     /// TOML file with settings.
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip)]
-    pub config: Option<PathBuf>,
-    /// Name of the planner in its zenoh keys [default: planner].
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub name: Option<String>,
-    /// Folder of the checkpoints [default: models].
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub models_dir: Option<PathBuf>,
-    /// Where gRPC listens [default: 127.0.0.1:50051].
-    #[arg(long, value_name = "ADDRESS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub grpc_listen: Option<SocketAddr>,
-    /// Where clients of openpi are listened to [default: nowhere].
-    #[arg(long, value_name = "ADDRESS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub openpi_listen: Option<SocketAddr>,
-    /// Most plan requests that wait for the model [default: 64].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub queue_capacity: Option<NonZeroU16>,
-    /// Most goal images that are kept [default: 1024].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub goal_capacity: Option<NonZeroU16>,
-    /// Most models that are served, `random` among them [default: 32].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model_capacity: Option<NonZeroU16>,
-    /// Most checkpoints of a model that are kept after they were swapped out [default: 3].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub retired_capacity: Option<NonZeroU16>,
-    /// Most plans that are made together [default: 64].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub batch_size: Option<NonZeroU16>,
-    /// How long a plan waits for company, in milliseconds [default: 0].
-    #[arg(long, value_name = "MS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub batch_delay_ms: Option<u16>,
-    /// Threads that plans which are made together are spread over [default: 1].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub threads: Option<NonZeroU16>,
-    /// What images are embedded in: float32 or, where the processor has AVX512-BF16, bfloat16 [default: float32].
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub precision: Option<String>,
-    /// Policy towards checkpoints that no trusted key signed [default: warn if there are trusted keys, else off].
-    #[arg(long, value_parser = ["off", "warn", "enforce"])]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub trust: Option<String>,
-    /// Files of public keys, in PEM, whose signatures of checkpoints count.
-    #[arg(long, value_name = "FILE", value_delimiter = ',')]
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub trusted_keys: Vec<PathBuf>,
-    /// Where Prometheus finds metrics, for example 127.0.0.1:9465 [default: nowhere].
-    #[arg(long, value_name = "ADDRESS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub metrics_listen: Option<SocketAddr>,
-    /// File of the tokens that clients of gRPC, openpi and metrics may bear instead of a certificate [default: none].
-    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub tokens: Option<PathBuf>,
-    /// How to join the others.
+    #[arg(long = "config", value_name = "FILE")]
+    pub file: Option<PathBuf>,
+    /// Settings on the command line, or their defaults.
     #[command(flatten)]
-    pub session: SessionConfig,
+    pub config: Config,
 }

@@ -1,6 +1,6 @@
 //! The planner's process.
 
-use planner::config::{Args, Config};
+use planner::config::Args;
 use service_kit::{config, shutdown, telemetry};
 
 fn main() -> anyhow::Result<()> {
@@ -8,9 +8,9 @@ fn main() -> anyhow::Result<()> {
 }
 
 async fn program() -> anyhow::Result<()> {
-    let args: Args = config::parse();
+    let (Args { file, config }, sources) = config::parse_with_sources();
     let _telemetry = telemetry::init("cpn-planner")?;
-    let config: Config = config::load("CPN_PLANNER_", args.config.as_deref(), &args)?;
+    let config = config::load("CPN_PLANNER_", file.as_deref(), &config, &sources)?;
     let planner = planner::start(config).await?;
     shutdown::requested().await?;
     planner.shutdown().await

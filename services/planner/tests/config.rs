@@ -2,9 +2,9 @@
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
-use clap::Parser;
 use planner::Config;
 use planner::config::Args;
+use service_kit::config;
 use signing::Trust;
 use std::io::Write;
 use std::path::PathBuf;
@@ -13,13 +13,21 @@ use tempfile::NamedTempFile;
 fn load(file: &str, arguments: &[&str]) -> anyhow::Result<Config> {
     let mut toml = NamedTempFile::new()?;
     toml.write_all(file.as_bytes())?;
-    let args = Args::try_parse_from([&["cpn-planner"], arguments].concat())?;
-    service_kit::config::load("CPN_PLANNER_TEST_", Some(toml.path()), &args)
+    let (Args { config, .. }, sources) = config::parse_from([&["cpn-planner"], arguments].concat())?;
+    config::load("CPN_PLANNER_TEST_", Some(toml.path()), &config, &sources)
 }
 
 #[test]
 fn what_is_not_set_is_the_default() {
     assert_eq!(load("", &[]).unwrap(), Config::default());
+}
+
+#[test]
+fn a_default_does_not_win_over_the_file() {
+    let file = "queue_capacity = 7\nprecision = 'bfloat16'\ngrpc_listen = '127.0.0.1:1'";
+    let config = load(file, &["--queue-capacity", "64"]).unwrap();
+    assert_eq!((config.queue_capacity.get(), config.grpc_listen.port()), (64, 1));
+    assert_eq!(config.precision, cpn::encoder::Precision::Bfloat16);
 }
 
 #[test]

@@ -3,9 +3,8 @@
 use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 use service_kit::SessionConfig;
-use std::net::SocketAddr;
-use std::num::NonZeroU16;
 use std::path::PathBuf;
+use trainer::service;
 
 /// Take in demonstrations, train the learned methods, publish checkpoints.
 #[derive(Debug, Parser)]
@@ -45,51 +44,14 @@ pub enum Command {
     Rollback(RollbackArgs),
 }
 
-/// What was typed; what was not is left to the environment, the file and the defaults.
-#[derive(Debug, Args, Serialize)]
+/// Arguments of `serve`. Each option is also read from the environment (CPN_TRAINER_MAX_RUNS) and from the file.
+#[derive(Debug, Args)]
 pub struct ServeArgs {
     /// TOML file with these settings.
-    #[arg(long)]
-    #[serde(skip)]
-    pub config: Option<PathBuf>,
-    /// Name of the trainer in its zenoh keys [default: trainer].
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<String>,
-    /// Where episodes are kept.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    dataset: Option<PathBuf>,
-    /// Whose checkpoints are published.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    checkpoints: Option<PathBuf>,
-    /// Versions of a model that are kept.
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    keep_versions: Option<NonZeroU16>,
-    /// Folder of the training runs' folders [default: runs/training].
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    runs: Option<PathBuf>,
-    /// Most training runs at the same time [default: 1].
-    #[arg(long, value_name = "COUNT")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    max_runs: Option<NonZeroU16>,
-    /// Where gRPC listens [default: 127.0.0.1:50052].
-    #[arg(long, value_name = "ADDRESS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    grpc_listen: Option<SocketAddr>,
-    /// Where Prometheus finds metrics, for example 127.0.0.1:9464 [default: nowhere].
-    #[arg(long, value_name = "ADDRESS")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    metrics_listen: Option<SocketAddr>,
-    /// File of the tokens that clients of gRPC and metrics may bear instead of a certificate [default: none].
-    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    tokens: Option<PathBuf>,
+    #[arg(long = "config", value_name = "FILE")]
+    pub file: Option<PathBuf>,
     #[command(flatten)]
-    session: SessionConfig,
+    pub config: service::Config,
 }
 
 /// What was typed; what was not is left to the environment, the file and the defaults.

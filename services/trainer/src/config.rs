@@ -81,7 +81,10 @@ fn value(key: &str, text: &str) -> Value {
     if TEXTS.contains(&key) {
         return Value::from(text);
     }
-    text.parse().unwrap_or_else(|never| match never {})
+    // Figment's own reading of text knows neither exponents nor that a decimal fraction needs 64 bits.
+    let value =
+        toml::from_str::<toml::Table>(&format!("value = {text}")).ok().and_then(|mut table| table.remove("value"));
+    value.and_then(|value| Value::serialize(value).ok()).unwrap_or_else(|| Value::from(text))
 }
 
 impl Config {

@@ -5,8 +5,8 @@ mod cli;
 
 use anyhow::{anyhow, bail, ensure};
 use cli::{
-    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, StartArgs, StopArgs,
-    TrainerArgs, VerifyArgs, VersionsArgs, WatchArgs,
+    Cli, Command, MirrorArgs, PresetArgs, PromoteArgs, ReplayArgs, RollbackArgs, RunsArgs, ServeArgs, StartArgs,
+    StopArgs, TrainerArgs, VerifyArgs, VersionsArgs, WatchArgs,
 };
 use comfy_table::{LineStyle, Table, presets};
 use cpn::Preset;
@@ -30,11 +30,11 @@ fn main() -> anyhow::Result<()> {
 }
 
 async fn program() -> anyhow::Result<()> {
-    let cli: Cli = config::parse();
+    let (cli, sources): (Cli, _) = config::parse_with_sources();
     let _telemetry = telemetry::init("cpn-trainer")?;
     match cli.command {
-        Command::Serve(arguments) => {
-            serve(config::load("CPN_TRAINER_", arguments.config.as_deref(), &arguments)?).await
+        Command::Serve(ServeArgs { file, config }) => {
+            serve(config::load("CPN_TRAINER_", file.as_deref(), &config, &sources)?).await
         }
         Command::Train(arguments) => {
             memory::keep()?;

@@ -1,7 +1,7 @@
 //! The trainer's network face: demonstrations in, checkpoints out, training runs started, watched and stopped.
 
 use crate::ingest::{Ingest, Limits};
-use crate::publish;
+use crate::publish::{self, Publisher};
 use crate::recorder::{self, Recorder};
 use crate::recordings::Recordings;
 use crate::runs::{self, Runs};
@@ -13,19 +13,19 @@ use serde::{Deserialize, Serialize};
 use service_kit::access::Access;
 use service_kit::changes::Changes;
 use service_kit::session::Connection;
-use service_kit::{GrpcServer, SessionConfig, metrics, session};
-use std::net::{Ipv4Addr, SocketAddr};
+use service_kit::{GrpcServer, SessionConfig, config, metrics, session};
+use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::task::JoinSet;
 use tracing::info;
 use wire::{access, key};
 use zenoh::liveliness::LivelinessToken;
 
-/// How long requests in flight may take to finish at shutdown.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long requests in flight may take to finish at shutdown, after training runs have saved their states: with the rest of it,
+/// less than ten seconds.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(7);
 
 /// What can be changed of a trainer.
 pub(crate) const CHANGES: Changes = Changes {
@@ -33,51 +33,54 @@ pub(crate) const CHANGES: Changes = Changes {
     methods: &[("/cpn.v1.TrainerService/StartRun", "start_run"), ("/cpn.v1.TrainerService/StopRun", "stop_run")],
 };
 
-/// Settings of the service.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+/// Settings of the service: options of its command line, keys of its file.
+#[derive(Debug, Clone, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Names the trainer in its zenoh keys.
+    /// Name of the trainer in its zenoh keys.
+    #[arg(long, default_value = "trainer")]
     pub name: String,
-    /// Where episodes are kept.
+    /// Folder of the recorded demonstrations.
+    #[arg(long, value_name = "FOLDER", default_value = "data/demonstrations")]
     pub dataset: PathBuf,
-    /// Whose checkpoints are published.
+    /// Folder of the checkpoints to publish.
+    #[arg(long, value_name = "FOLDER", default_value = "runs/checkpoints")]
     pub checkpoints: PathBuf,
-    /// Versions of a model that are kept.
+    /// Maximum number of a model's versions kept; the oldest are removed.
+    #[arg(long, value_name = "COUNT", default_value = "5")]
     pub keep_versions: NonZeroU16,
-    /// Folder of the training runs' folders.
+    /// Folder of the training runs, a folder for each.
+    #[arg(long, value_name = "FOLDER", default_value = "runs/training")]
     pub runs: PathBuf,
-    /// Most training runs at the same time.
+    /// Maximum number of training runs at the same time; one more is refused.
+    #[arg(long, value_name = "COUNT", default_value = "1")]
     pub max_runs: NonZeroU16,
-    /// Where gRPC listens; port 0 takes a free one.
+    /// Listening address of gRPC; port 0 takes a free one.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:50052")]
     pub grpc_listen: SocketAddr,
-    /// Where Prometheus finds metrics; none are served if it is not given.
+    /// Listening address for Prometheus, for example 127.0.0.1:9464 [default: none].
+    #[arg(long, value_name = "ADDRESS")]
     pub metrics_listen: Option<SocketAddr>,
-    /// What is started for a training run: this program, unless another embeds the service.
-    #[serde(skip)]
+    /// Program of a training run: this one, unless another embeds the service.
+    #[arg(skip = this_program())]
+    #[serde(skip, default = "this_program")]
     pub program: PathBuf,
-    /// File of the tokens that clients of gRPC and metrics may bear instead of a certificate.
+    /// File of tokens that clients of gRPC and metrics may send instead of a certificate [default: none].
+    #[arg(long, env = "CPN_TOKENS", value_name = "FILE")]
     pub tokens: Option<PathBuf>,
-    /// How to join the others.
+    /// Connection to the zenoh network.
+    #[command(flatten)]
     pub session: SessionConfig,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self {
-            name: "trainer".into(),
-            dataset: "data/demonstrations".into(),
-            checkpoints: "runs/checkpoints".into(),
-            keep_versions: const { NonZeroU16::new(5).expect("not zero") },
-            runs: "runs/training".into(),
-            max_runs: NonZeroU16::MIN,
-            grpc_listen: (Ipv4Addr::LOCALHOST, 50052).into(),
-            metrics_listen: None,
-            program: std::env::current_exe().unwrap_or_else(|_| "cpn-trainer".into()),
-            tokens: None,
-            session: SessionConfig::default(),
-        }
+        config::defaults()
     }
+}
+
+fn this_program() -> PathBuf {
+    std::env::current_exe().unwrap_or_else(|_| "cpn-trainer".into())
 }
 
 /// A running service.
@@ -88,7 +91,7 @@ pub struct Service {
     runs: Runs,
     runs_zenoh: RunsZenoh,
     grpc: GrpcServer,
-    tasks: JoinSet<anyhow::Result<()>>,
+    publisher: Publisher,
     connection: Connection,
     alive: LivelinessToken,
 }
@@ -130,16 +133,16 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
     let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
     let runs_zenoh = runs_zenoh::start(&session, &name, &runs).await?;
-    let mut tasks = publish::start(&session, &versions).await?;
+    let mut publisher = publish::start(&session, &versions).await?;
     let measured = runs.clone();
-    tasks.spawn(async move {
+    publisher.tasks.spawn(async move {
         runs_metrics::follow(measured).await;
         Ok(())
     });
     let alive = session.liveliness().declare_token(token).await.map_err(|e| anyhow!(e))?;
     grpc.ready().await;
     info!(name, grpc = %grpc.address, "trainer is ready");
-    Ok(Service { session, recorder, runs, runs_zenoh, grpc, tasks, connection, alive })
+    Ok(Service { session, recorder, runs, runs_zenoh, grpc, publisher, connection, alive })
 }
 
 impl Service {
@@ -158,7 +161,7 @@ impl Service {
     /// # Errors
     /// Why it failed.
     pub async fn failed(&mut self) -> anyhow::Result<()> {
-        match self.tasks.join_next().await {
+        match self.publisher.tasks.join_next().await {
             Some(result) => result?,
             None => Ok(()),
         }
@@ -175,7 +178,7 @@ impl Service {
         // Who watches a run has seen its end; a client that keeps asking does not keep the service.
         let drained = tokio::time::timeout(DRAIN_TIMEOUT, self.grpc.drain()).await;
         drop(self.runs_zenoh);
-        self.tasks.shutdown().await;
+        self.publisher.tasks.shutdown().await;
         self.session.close().await.map_err(|e| anyhow!(e))?;
         drained.unwrap_or(Ok(()))
     }

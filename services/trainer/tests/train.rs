@@ -149,6 +149,10 @@ fn settings_come_in_layers_over_a_preset() {
     assert_eq!(config.training.goals, GoalSampling::Hindsight);
 
     assert_eq!(load(&["dataset=2024"]).unwrap().dataset, Path::new("2024"));
+    for text in ["1e-3", "0.001"] {
+        let rate = load(&[&format!("training.peak_learning_rate={text}")]).unwrap().training.peak_learning_rate;
+        assert_eq!(rate, 1e-3, "{text}");
+    }
 
     let refused = |change: &str| format!("{:#}", load(&[change]).unwrap_err());
     assert!(refused("training.epoch=7").contains("unknown field"), "{}", refused("training.epoch=7"));
