@@ -19,9 +19,9 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Instant;
 use tch::Tensor;
-use trainer::dataset::Dataset;
-use trainer::learner::{Learner, StageTimes};
-use trainer::sampler::Sampler;
+use trainer::training::dataset::Dataset;
+use trainer::training::learner::{Learner, StageTimes};
+use trainer::training::sampler::Sampler;
 
 /// Distinct batches, over and over.
 const BATCHES: usize = 8;
@@ -96,7 +96,7 @@ fn write(path: &Path, args: &Args) {
     let Frames::Images(pixels) = dataset.frames() else { panic!("expected images") };
     let samples: Vec<_> =
         (0..).flat_map(|epoch| sampler.epoch(epoch)).take(BATCHES * recipe.training.batch_size).collect();
-    let index = |step: fn(&trainer::sampler::Sample) -> u32| {
+    let index = |step: fn(&trainer::training::sampler::Sample) -> u32| {
         let frame = |sample| dataset.episodes()[sample_episode(sample)].first_frame + step(sample) as usize;
         let indices: Vec<i64> = samples.iter().map(|sample| frame(sample) as i64).collect();
         Tensor::from_slice(&indices).view([BATCHES as i64, -1])
@@ -117,7 +117,7 @@ fn write(path: &Path, args: &Args) {
     std::fs::write(path.with_extension("recipe.json"), serde_json::to_string(&recipe).unwrap()).unwrap();
 }
 
-fn sample_episode(sample: &trainer::sampler::Sample) -> usize {
+fn sample_episode(sample: &trainer::training::sampler::Sample) -> usize {
     sample.episode as usize
 }
 

@@ -6,7 +6,7 @@ use service_kit::SessionConfig;
 use std::path::PathBuf;
 use trainer::service;
 
-/// Take in demonstrations, train the learned methods, publish checkpoints.
+/// Trainer: records demonstrations, trains the learned methods, publishes checkpoints.
 #[derive(Debug, Parser)]
 #[command(version)]
 pub struct Cli {
@@ -16,31 +16,31 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Keep the episodes of demonstration streams, publish the checkpoints of a folder, and run training when asked to.
+    /// Run the service: record demonstration streams, publish checkpoints, run training on request.
     Serve(ServeArgs),
-    /// Train a model; the same command goes on where an interrupted one stopped.
+    /// Train a model; the same command resumes an interrupted run.
     Train(TrainArgs),
-    /// Print all settings of a preset, as a file that `train --config` takes.
+    /// Print all settings of a preset, as a file for `train --config`.
     Preset(PresetArgs),
-    /// Start a training run of a trainer that serves, or take up one.
+    /// Start or resume a training run of the service.
     Start(StartArgs),
-    /// Let a training run save its state and end.
+    /// Stop a training run of the service, after it has saved its state.
     Stop(StopArgs),
-    /// List the training runs.
+    /// List the training runs of the service.
     Runs(RunsArgs),
-    /// Show the progress of a training run until it ends.
+    /// Show the progress of a training run of the service until it ends.
     Watch(WatchArgs),
-    /// Send recordings to a recorder, as the workers did.
+    /// Send recordings to another trainer, as workers do.
     Replay(ReplayArgs),
-    /// Fetch what another recorder keeps, then follow it.
+    /// Copy the recordings of another trainer, then follow it.
     Mirror(MirrorArgs),
-    /// Read every recording and report what is in them and what is wrong.
+    /// Check every recording, and report its contents and faults.
     Verify(VerifyArgs),
-    /// List the published versions that a trainer keeps.
+    /// List the published versions of models.
     Versions(VersionsArgs),
-    /// Let planners serve a version that is kept.
+    /// Make planners serve another version.
     Promote(PromoteArgs),
-    /// Let planners serve the version that was promoted before.
+    /// Make planners serve the version that was promoted before.
     Rollback(RollbackArgs),
 }
 
@@ -54,46 +54,46 @@ pub struct ServeArgs {
     pub config: service::Config,
 }
 
-/// What was typed; what was not is left to the environment, the file and the defaults.
+/// Arguments of `train`: overrides of environment, file and preset.
 #[derive(Debug, Args, Serialize)]
 pub struct TrainArgs {
     /// TOML file with these settings.
     #[arg(long)]
     #[serde(skip)]
     pub config: Option<PathBuf>,
-    /// Folder of the demonstrations.
+    /// Folder of the recorded demonstrations [default: data/demonstrations].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     dataset: Option<PathBuf>,
-    /// Where the checkpoint goes.
+    /// Checkpoint to write [default: runs/checkpoints/PRESET.safetensors].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// What to train: paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn or jenga [default: cpn].
+    /// Recipe: paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn or jenga [default: cpn].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     preset: Option<String>,
-    /// Tasks that the model must not see.
+    /// Tasks left out of training, separated by commas.
     #[arg(long, value_delimiter = ',')]
     #[serde(skip_serializing_if = "Option::is_none")]
     hold_out: Option<Vec<String>>,
-    /// Seed of initialisation and sampling.
+    /// Seed of initialisation and sampling [default: 0].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     seed: Option<u64>,
-    /// Threads that compute [default: 1].
+    /// Number of threads [default: 1].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     threads: Option<usize>,
-    /// How often the run saves its state [default: 60].
+    /// Interval between saved states, in seconds [default: 60].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     save_interval_seconds: Option<f64>,
-    /// Where the run keeps its progress, events and curve [default: runs/training/ and the name of the checkpoint].
+    /// Folder of progress, TensorBoard events and learning curve [default: runs/training/NAME of the checkpoint].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     run_dir: Option<PathBuf>,
-    /// Change any setting that `cpn-trainer preset` shows, for example training.epochs=8.
+    /// Override of any setting that `cpn-trainer preset` prints, for example training.epochs=8.
     #[arg(long, value_name = "KEY=VALUE")]
     #[serde(skip)]
     pub set: Vec<String>,
@@ -101,7 +101,7 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip)]
     pub json: bool,
-    /// First follow the network's demonstrations until so many are kept.
+    /// Number of demonstrations to copy from the network's trainer before training begins.
     #[arg(long, value_name = "COUNT")]
     #[serde(skip)]
     pub demonstrations: Option<usize>,
@@ -110,7 +110,7 @@ pub struct TrainArgs {
     pub session: SessionConfig,
 }
 
-/// Which trainer is asked.
+/// Connection to a trainer.
 #[derive(Debug, Args)]
 pub struct TrainerArgs {
     /// Name of the trainer.
@@ -120,7 +120,7 @@ pub struct TrainerArgs {
     pub session: SessionConfig,
 }
 
-/// What was typed.
+/// Arguments of `preset`.
 #[derive(Debug, Args)]
 pub struct PresetArgs {
     /// One of paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn, jenga.
@@ -128,28 +128,28 @@ pub struct PresetArgs {
     pub name: String,
 }
 
-/// What was typed.
+/// Arguments of `start`.
 #[derive(Debug, Args)]
 pub struct StartArgs {
     /// Name of the run and of its checkpoint.
     pub name: String,
-    /// Where the settings start from.
+    /// Recipe: paper-bc, paper-te-bc, paper-upn, paper-cpn, cpn or jenga [default: cpn].
     #[arg(long)]
     pub preset: Option<String>,
-    /// Tasks that the model must not see.
+    /// Tasks left out of training, separated by commas.
     #[arg(long, value_delimiter = ',')]
     pub hold_out: Vec<String>,
     /// Seed of initialisation and sampling.
     #[arg(long)]
     pub seed: Option<u64>,
-    /// A further setting of `train`, in TOML: --set epochs=50, for example.
+    /// Override of any setting that `cpn-trainer preset` prints, for example training.epochs=8.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub settings: Vec<String>,
     #[command(flatten)]
     pub trainer: TrainerArgs,
 }
 
-/// What was typed.
+/// Arguments of `stop`.
 #[derive(Debug, Args)]
 pub struct StopArgs {
     /// Name of the run.
@@ -158,7 +158,7 @@ pub struct StopArgs {
     pub trainer: TrainerArgs,
 }
 
-/// What was typed.
+/// Arguments of `runs`.
 #[derive(Debug, Args)]
 pub struct RunsArgs {
     /// Print JSON instead of a table.
@@ -168,7 +168,7 @@ pub struct RunsArgs {
     pub trainer: TrainerArgs,
 }
 
-/// What was typed.
+/// Arguments of `watch`.
 #[derive(Debug, Args)]
 pub struct WatchArgs {
     /// Name of the run.
@@ -177,7 +177,7 @@ pub struct WatchArgs {
     pub trainer: TrainerArgs,
 }
 
-/// What was typed.
+/// Arguments of `replay`.
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
     /// Folder of the recordings.
@@ -190,29 +190,29 @@ pub struct ReplayArgs {
     pub session: SessionConfig,
 }
 
-/// What was typed.
+/// Arguments of `mirror`.
 #[derive(Debug, Args)]
 pub struct MirrorArgs {
-    /// Where the recordings go.
+    /// Folder to record to.
     #[arg(long, default_value = "data/demonstrations")]
     pub dataset: PathBuf,
-    /// Stop as soon as nothing is lacking.
+    /// End once every recording is copied.
     #[arg(long)]
     pub once: bool,
     #[command(flatten)]
     pub session: SessionConfig,
 }
 
-/// What was typed.
+/// Arguments of `verify`.
 #[derive(Debug, Args)]
 pub struct VerifyArgs {
     /// Folder of the recordings.
     #[arg(long, default_value = "data/demonstrations")]
     pub dataset: PathBuf,
-    /// Tasks that there must be at least.
+    /// Minimum number of tasks.
     #[arg(long, default_value_t = 1)]
     pub tasks: usize,
-    /// Episodes that each task must have at least.
+    /// Minimum number of episodes of each task.
     #[arg(long, default_value_t = 1)]
     pub episodes: usize,
     /// Print JSON instead of a table.
@@ -220,10 +220,10 @@ pub struct VerifyArgs {
     pub json: bool,
 }
 
-/// What was typed.
+/// Arguments of `versions`.
 #[derive(Debug, Args)]
 pub struct VersionsArgs {
-    /// The model whose versions to list; all if none is given.
+    /// Name of the model; all models if none is given.
     pub model: Option<String>,
     /// Print JSON instead of a table.
     #[arg(long)]
@@ -232,18 +232,18 @@ pub struct VersionsArgs {
     pub session: SessionConfig,
 }
 
-/// What was typed.
+/// Arguments of `promote`.
 #[derive(Debug, Args)]
 pub struct PromoteArgs {
     /// Name of the model.
     pub model: String,
-    /// The version to serve.
+    /// Number of the version.
     pub version: u32,
     #[command(flatten)]
     pub session: SessionConfig,
 }
 
-/// What was typed.
+/// Arguments of `rollback`.
 #[derive(Debug, Args)]
 pub struct RollbackArgs {
     /// Name of the model.

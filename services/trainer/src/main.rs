@@ -16,12 +16,15 @@ use service_kit::session::SessionConfig;
 use service_kit::{config, output, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use trainer::config::Config;
-use trainer::journal::Journal;
-use trainer::progress::{Bar, JsonLines, Observer, StopIf, print_line};
-use trainer::recordings::Recordings;
-use trainer::train::{self, Outcome};
-use trainer::{client, memory, mirror, publish, replay, service, verify};
+use trainer::record::folder::Recordings;
+use trainer::record::{mirror, send, verify};
+use trainer::runs::client;
+use trainer::training::allocator;
+use trainer::training::config::Config;
+use trainer::training::journal::Journal;
+use trainer::training::progress::{Bar, JsonLines, Observer, StopIf, print_line};
+use trainer::training::run::{self, Outcome};
+use trainer::{publish, service};
 use wire::training::{Run, RunState, StartRunRequest};
 use zenoh::Session;
 
@@ -37,7 +40,7 @@ async fn program() -> anyhow::Result<()> {
             serve(config::load("CPN_TRAINER_", file.as_deref(), &config, &sources)?).await
         }
         Command::Train(arguments) => {
-            memory::keep()?;
+            allocator::keep()?;
             let config = Config::load(arguments.config.as_deref(), &arguments, &arguments.set)?;
             let enough = match arguments.demonstrations {
                 Some(count) => gather(&config, count, &arguments.session).await?,
@@ -91,7 +94,7 @@ async fn train(config: Config, json: bool) -> anyhow::Result<Outcome> {
             if json { Box::new(JsonLines::default()) } else { Box::new(Bar::new(&config.name())) };
         let journal = Journal::open(config.run_dir(), &config.out)?;
         let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(stopped), shown, Box::new(journal)];
-        train::run(&config, &mut observers)
+        run::run(&config, &mut observers)
     });
     tokio::select! {
         outcome = &mut run => outcome?,
@@ -146,8 +149,9 @@ async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: Runs
         table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));
         table.set_header(["run", "state", "step", "of", "loss"]);
         for Run { name, state, progress } in &runs {
-            let of =
-                |value: fn(&trainer::progress::Progress) -> String| progress.as_ref().map(value).unwrap_or_default();
+            let of = |value: fn(&trainer::training::progress::Progress) -> String| {
+                progress.as_ref().map(value).unwrap_or_default()
+            };
             let (step, steps) = (of(|p| p.step.to_string()), of(|p| p.steps.to_string()));
             table.add_row([name, state.name(), &step, &steps, &of(|p| format!("{:.4}", p.loss))]);
         }
@@ -167,7 +171,7 @@ async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
 
 async fn replay(ReplayArgs { dataset, tasks, session }: ReplayArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
-    replay::run(&session, &dataset, &tasks).await?;
+    send::run(&session, &dataset, &tasks).await?;
     session.close().await.map_err(|e| anyhow!(e))
 }
 

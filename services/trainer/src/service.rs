@@ -1,13 +1,12 @@
 //! The trainer's network face: demonstrations in, checkpoints out, training runs started, watched and stopped.
 
-use crate::ingest::{Ingest, Limits};
+use crate::publish::versions::Versions;
 use crate::publish::{self, Publisher};
-use crate::recorder::{self, Recorder};
-use crate::recordings::Recordings;
+use crate::record::folder::Recordings;
+use crate::record::ingest::{Ingest, Limits};
+use crate::record::{self, Recorder};
+use crate::runs::zenoh::RunsZenoh;
 use crate::runs::{self, Runs};
-use crate::runs_zenoh::{self, RunsZenoh};
-use crate::versions::Versions;
-use crate::{grpc, runs_metrics};
 use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
 use service_kit::access::Access;
@@ -125,18 +124,18 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
     };
     let (recordings, versions, runs) = tokio::task::spawn_blocking(open).await??;
     // Before the network is waited for, so that health tells of it.
-    let mut grpc = grpc::start(runs.clone(), listen, access).await?;
+    let mut grpc = runs::grpc::start(runs.clone(), listen, access).await?;
     let session = session::open(network).await?;
     session::claim(&session, network, &token).await?;
     let connection = Connection::follow(&session, network);
     grpc.follow(connection.connected());
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
-    let recorder = recorder::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
-    let runs_zenoh = runs_zenoh::start(&session, &name, &runs).await?;
+    let recorder = record::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
+    let runs_zenoh = runs::zenoh::start(&session, &name, &runs).await?;
     let mut publisher = publish::start(&session, &versions).await?;
     let measured = runs.clone();
     publisher.tasks.spawn(async move {
-        runs_metrics::follow(measured).await;
+        runs::metrics::follow(measured).await;
         Ok(())
     });
     let alive = session.liveliness().declare_token(token).await.map_err(|e| anyhow!(e))?;

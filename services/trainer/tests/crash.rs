@@ -15,7 +15,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use tokio::task::JoinSet;
-use trainer::replay;
+use trainer::record::send;
 use wire::key;
 use zenoh::Session;
 use zenoh::sample::SampleKind;
@@ -56,7 +56,7 @@ async fn stream(session: Session, first: u64, kept: Arc<Mutex<BTreeSet<u64>>>, s
     let mut sent = Vec::new();
     for seed in (first..).step_by(SENDERS as usize) {
         let episode = episode("reach", seed, STEPS);
-        replay::send(&session, &episode).await.unwrap();
+        send::send(&session, &episode).await.unwrap();
         kept.lock().unwrap().insert(seed);
         sent.push(episode);
         if *stop.lock().unwrap() {
@@ -110,7 +110,7 @@ async fn survives(kills: u32, endpoint: &str) {
     expected.sort();
     assert!(expected.len() >= kills as usize / 2, "most lives kept something");
     assert!(files(&data) == expected, "every episode, and each as it was sent");
-    let report = trainer::verify::run(&data, 1, expected.len()).unwrap();
+    let report = trainer::record::verify::run(&data, 1, expected.len()).unwrap();
     assert_eq!(report.faults, Vec::<String>::new());
     let left: Vec<_> = std::fs::read_dir(data.join("reach")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(left.len(), expected.len(), "nothing unfinished is left: {left:?}");

@@ -8,9 +8,9 @@ use common::{commit, episode, files, info, record, sessions, steps};
 use recording::Episode;
 use std::time::Duration;
 use tokio::task::JoinSet;
-use trainer::ingest::Limits;
-use trainer::recordings::Recordings;
-use trainer::replay;
+use trainer::record::folder::Recordings;
+use trainer::record::ingest::Limits;
+use trainer::record::send;
 use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse, DemonstrationStep, RecordedEpisode};
 use wire::{Code, Error, Image, decode, encode, key, query};
 use zenoh::Session;
@@ -88,14 +88,14 @@ async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
     }
     worker.put(key::demonstration_step("reach-1", "0").unwrap(), [0xff; 9].as_slice()).await.unwrap();
     assert_eq!(send_commit(&worker, &commit(&good)).await.unwrap(), [0, 1, 2], "what was refused is forgotten");
-    replay::send(&worker, &good).await.unwrap();
+    send::send(&worker, &good).await.unwrap();
 
     let mut steps = steps("reach", 2, 3);
     for step in &mut steps {
         step.frame = step.frame.clone().rendered_as("other").unwrap();
     }
     let other = Episode::new(info("reach", 2, &steps), steps).unwrap();
-    let error = replay::send(&worker, &other).await.unwrap_err();
+    let error = send::send(&worker, &other).await.unwrap_err();
     assert_eq!(error, Error::new(Code::FailedPrecondition, "render_spec", common::SPEC, "other"));
     assert_eq!(files(folder.path()).len(), 1);
 }
@@ -111,7 +111,7 @@ async fn a_recorder_that_cannot_keep_up_loses_nothing_for_good() {
     let mut senders = JoinSet::new();
     for episode in episodes.clone() {
         let worker = worker.clone();
-        senders.spawn(async move { replay::send(&worker, &episode).await });
+        senders.spawn(async move { send::send(&worker, &episode).await });
     }
     while let Some(sent) = senders.join_next().await {
         sent.unwrap().unwrap();
@@ -127,7 +127,7 @@ async fn an_episode_that_fell_silent_makes_room() {
     let (trainer, worker) = sessions("tcp/127.0.0.1:17454").await;
     let (_recorder, _) = record(&trainer, folder.path(), Limits { episodes: 1, silence: Duration::ZERO }).await;
     assert_eq!(send_commit(&worker, &commit(&episode("reach", 1, 2))).await.unwrap(), [0, 1]);
-    replay::send(&worker, &episode("reach", 2, 2)).await.unwrap();
+    send::send(&worker, &episode("reach", 2, 2)).await.unwrap();
 }
 
 /// What a subscriber missed, it can ask for: the same bytes at the same keys.
@@ -139,10 +139,10 @@ async fn what_is_kept_is_announced_listed_and_sent_again() {
     let streamed = trainer.declare_subscriber(key::demonstration_step("*", "*").unwrap()).await.unwrap();
     let (recorder, _) = record(&trainer, folder.path(), Limits::default()).await;
     let (first, second) = (episode("reach", 1, 3), episode("push", 2, 4));
-    replay::send(&worker, &first).await.unwrap();
+    send::send(&worker, &first).await.unwrap();
     let mut stream: Vec<_> =
         streamed.drain().map(|s| (s.key_expr().to_string(), s.payload().to_bytes().to_vec())).collect();
-    replay::send(&worker, &second).await.unwrap();
+    send::send(&worker, &second).await.unwrap();
     for episode in [&first, &second] {
         let sample = announced.recv_async().await.unwrap();
         let key = key::demonstration_recorded(&episode.info().episode_id).unwrap();

@@ -9,7 +9,8 @@ use futures::StreamExt;
 use service_kit::SessionConfig;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use trainer::{replay, service};
+use trainer::record::send;
+use trainer::service;
 use wire::training::StartRunRequest;
 
 /// The metrics, as Prometheus asks for them.
@@ -42,7 +43,7 @@ async fn recordings_and_runs_are_counted() {
     .unwrap();
     let connecting = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
     let session = service_kit::session::open(&connecting).await.unwrap();
-    replay::send(&session, &episode("reach", 2, 7)).await.unwrap();
+    send::send(&session, &episode("reach", 2, 7)).await.unwrap();
 
     let settings = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 2".into();
     let request = StartRunRequest { name: "short".into(), settings, ..StartRunRequest::default() };

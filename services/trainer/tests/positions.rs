@@ -10,11 +10,11 @@ use cpn::{Agent, Frames, Input, ModelConfig, Preset, Recipe, Training, checkpoin
 use recording::Episode;
 use std::path::Path;
 use tch::Tensor;
-use trainer::config::Config;
-use trainer::dataset::Dataset;
-use trainer::progress::StopIf;
-use trainer::sampler::Sampler;
-use trainer::train::{self, Outcome};
+use trainer::training::config::Config;
+use trainer::training::dataset::Dataset;
+use trainer::training::progress::StopIf;
+use trainer::training::run::{self, Outcome};
+use trainer::training::sampler::Sampler;
 use wire::demonstration::RecordedEpisode;
 
 /// A little past where the hands end, as a block lies past the hand that pokes it.
@@ -70,7 +70,7 @@ fn end(agent: &Agent, mut hand: [f32; 3]) -> [f32; 3] {
 fn a_model_of_positions_learns_where_to_go() {
     let folder = tempfile::tempdir().unwrap();
     let config = config(folder.path());
-    let outcome = train::run(&config, &mut StopIf(|_| false)).unwrap();
+    let outcome = run::run(&config, &mut StopIf(|_| false)).unwrap();
     assert!(matches!(outcome, Outcome::Finished { .. }));
     let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
     assert_eq!((loaded.agent.config(), loaded.provenance.render_spec.as_str()), (&config.model, ""));
@@ -107,7 +107,7 @@ fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() 
 fn what_does_not_fit_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = config(folder.path());
-    let refusal = |config: &Config| format!("{:#}", train::run(config, &mut StopIf(|_| false)).unwrap_err());
+    let refusal = |config: &Config| format!("{:#}", run::run(config, &mut StopIf(|_| false)).unwrap_err());
     let images = folder.path().join("images");
     keep(&images, &episode("reach", 1, 5));
     let message = refusal(&Config { dataset: images, ..config.clone() });

@@ -12,10 +12,10 @@ use std::path::Path;
 use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::dataset::Dataset;
-use trainer::ingest::Limits;
-use trainer::recordings::Recordings;
-use trainer::{mirror, replay, verify};
+use trainer::record::folder::Recordings;
+use trainer::record::ingest::Limits;
+use trainer::record::{mirror, send, verify};
+use trainer::training::dataset::Dataset;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode};
 use wire::{Code, Image};
 
@@ -31,13 +31,13 @@ async fn a_replayed_dataset_is_the_same_to_the_byte() {
     dataset(from.path());
     let (trainer, sender) = sessions("tcp/127.0.0.1:17471").await;
     let _recorder = record(&trainer, to.path(), Limits::default()).await;
-    replay::run(&sender, from.path(), &["push".to_owned()]).await.unwrap();
+    send::run(&sender, from.path(), &["push".to_owned()]).await.unwrap();
     assert_eq!(files(to.path()), files(from.path())[..1], "one task");
     for _ in 0..2 {
-        replay::run(&sender, from.path(), &[]).await.unwrap();
+        send::run(&sender, from.path(), &[]).await.unwrap();
         assert_eq!(files(to.path()), files(from.path()));
     }
-    let error = replay::run(&sender, from.path(), &["pull".to_owned()]).await.unwrap_err().to_string();
+    let error = send::run(&sender, from.path(), &["pull".to_owned()]).await.unwrap_err().to_string();
     assert_eq!(error, r#"tasks: expected some of ["push", "reach"], got "pull""#);
 }
 
@@ -57,7 +57,7 @@ async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
         tokio::spawn(async move { mirror::follow(&joiner, &copies, usize::MAX).await })
     };
     for seed in 3..6 {
-        replay::send(&joiner, &episode("reach", seed, 4)).await.unwrap();
+        send::send(&joiner, &episode("reach", seed, 4)).await.unwrap();
     }
     let caught_up = async {
         while copies.all().len() < 6 {
@@ -96,7 +96,7 @@ async fn a_run_follows_the_stream_until_it_has_enough() {
     assert_eq!(told, serde_json::json!({"interrupted": {"step": 0}}), "three are not enough");
     let run = start();
     for seed in 3..5 {
-        replay::send(&sender, &episode("reach", seed, 4)).await.unwrap();
+        send::send(&sender, &episode("reach", seed, 4)).await.unwrap();
     }
     let ended = tokio::time::timeout(Duration::from_secs(60), run.wait_with_output()).await.expect("the run to end");
     assert!(ended.unwrap().status.success());

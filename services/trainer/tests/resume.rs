@@ -11,9 +11,9 @@ use rustix::process::{Pid, Signal, kill_process};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
-use trainer::journal::{self, Entry};
-use trainer::progress::Progress;
-use trainer::tensorboard::{self, Content};
+use trainer::training::journal::{self, Entry};
+use trainer::training::progress::Progress;
+use trainer::training::tensorboard::{self, Content};
 
 /// Steps of a pass: 21 samples in batches of 2.
 const STEPS_PER_EPOCH: u64 = 11;

@@ -80,7 +80,7 @@ impl Fixture {
             service,
         };
         // The declarations take a moment to arrive.
-        trainer::client::list(&fixture.session, NAME).await.unwrap();
+        trainer::runs::client::list(&fixture.session, NAME).await.unwrap();
         fixture
     }
 
@@ -352,7 +352,7 @@ async fn a_run_outlasts_the_service() {
     assert!((reached..400).contains(&step), "{step}");
     client.start(request("run", &settings)).await.unwrap();
     client.to_the_end("run").await;
-    let noted = trainer::journal::read(&folder.path().join("runs/run")).unwrap();
+    let noted = trainer::training::journal::read(&folder.path().join("runs/run")).unwrap();
     let steps: Vec<_> = noted.iter().map(|entry| entry.progress.step).collect();
     assert_eq!(steps, (1..=400).collect::<Vec<_>>());
     fixture.service.shutdown().await.unwrap();

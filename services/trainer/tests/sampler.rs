@@ -10,8 +10,8 @@ use cpn::recipe::GoalSampling;
 use cpn::{Input, ModelConfig, Preset, Recipe, Training};
 use std::collections::{BTreeMap, BTreeSet};
 use tch::Tensor;
-use trainer::dataset::Dataset;
-use trainer::sampler::{Sample, Sampler};
+use trainer::training::dataset::Dataset;
+use trainer::training::sampler::{Sample, Sampler};
 
 /// Steps of the episodes, the last without an action.
 const STEPS: [u32; 3] = [9, 23, 14];

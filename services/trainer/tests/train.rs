@@ -9,11 +9,11 @@ use cpn::recipe::GoalSampling;
 use cpn::{Input, MethodKind, ModelConfig, Preset, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
-use trainer::config::Config;
-use trainer::dataset::Dataset;
-use trainer::progress::{Observer, Progress, StopIf};
-use trainer::sampler::Sampler;
-use trainer::train::{self, Outcome};
+use trainer::training::config::Config;
+use trainer::training::dataset::Dataset;
+use trainer::training::progress::{Observer, Progress, StopIf};
+use trainer::training::run::{self, Outcome};
+use trainer::training::sampler::Sampler;
 
 fn config(folder: &Path, name: &str) -> Config {
     let dataset = folder.join("data");
@@ -33,7 +33,7 @@ fn quick(config: Config, epochs: u32, batch_size: usize) -> Config {
 }
 
 fn finished(config: &Config) -> String {
-    match train::run(config, &mut StopIf(|_| false)).unwrap() {
+    match run::run(config, &mut StopIf(|_| false)).unwrap() {
         Outcome::Finished { digest } => digest,
         Outcome::Interrupted { step } => panic!("interrupted at {step}"),
     }
@@ -46,7 +46,7 @@ fn an_interrupted_run_ends_with_the_same_weights() {
     let broken = config(folder.path(), "broken");
     for stop_at in [0, 2, 5] {
         assert_eq!(
-            train::run(&broken, &mut StopIf(|step| step == stop_at)).unwrap(),
+            run::run(&broken, &mut StopIf(|step| step == stop_at)).unwrap(),
             Outcome::Interrupted { step: stop_at }
         );
         assert!(!broken.out.exists(), "no checkpoint before the end");
@@ -83,12 +83,12 @@ impl Observer for Notes {
 fn progress_goes_on_after_an_interruption() {
     let folder = tempfile::tempdir().unwrap();
     let mut whole = Notes { began: Vec::new(), heard: Vec::new(), until: u64::MAX };
-    train::run(&config(folder.path(), "whole"), &mut whole).unwrap();
+    run::run(&config(folder.path(), "whole"), &mut whole).unwrap();
     let mut broken = Notes { began: Vec::new(), heard: Vec::new(), until: 5 };
     let config = config(folder.path(), "broken");
-    train::run(&config, &mut broken).unwrap();
+    run::run(&config, &mut broken).unwrap();
     broken.until = u64::MAX;
-    train::run(&config, &mut broken).unwrap();
+    run::run(&config, &mut broken).unwrap();
     assert_eq!((whole.began, broken.began), (vec![0], vec![0, 5]));
 
     let timeless = |heard: Vec<Progress>| -> Vec<Progress> {
@@ -107,8 +107,8 @@ fn progress_goes_on_after_an_interruption() {
 fn a_state_of_another_run_is_not_taken_up() {
     let folder = tempfile::tempdir().unwrap();
     let first = config(folder.path(), "same");
-    train::run(&first, &mut StopIf(|step| step == 1)).unwrap();
-    let error = train::run(&Config { seed: 5, ..first }, &mut StopIf(|_| false)).unwrap_err();
+    run::run(&first, &mut StopIf(|step| step == 1)).unwrap();
+    let error = run::run(&Config { seed: 5, ..first }, &mut StopIf(|_| false)).unwrap_err();
     assert!(format!("{error:#}").contains("expected the state of this run"), "{error:#}");
 }
 
@@ -186,7 +186,7 @@ fn training_lowers_the_loss() {
 fn bad_input_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let good = config(folder.path(), "x");
-    let refused = |config: &Config| format!("{:#}", train::run(config, &mut StopIf(|_| false)).unwrap_err());
+    let refused = |config: &Config| format!("{:#}", run::run(config, &mut StopIf(|_| false)).unwrap_err());
 
     let message = refused(&Config { hold_out: vec!["door-lokc".into()], ..good.clone() });
     assert!(message.contains("hold_out: expected some of [\"door-lock\", \"reach\"], got \"door-lokc\""), "{message}");
@@ -236,7 +236,7 @@ fn settings_are_checked_before_anything_is_read() {
     finished(&Config { threads: 1024, ..config.clone() });
     let config = Config { out: folder.path().join("folder"), ..config };
     std::fs::create_dir(&config.out).unwrap();
-    let error = format!("{:#}", train::run(&config, &mut StopIf(|_| false)).unwrap_err());
+    let error = format!("{:#}", run::run(&config, &mut StopIf(|_| false)).unwrap_err());
     assert!(error.starts_with("out: expected the path of a file, got that of a folder"), "{error}");
 }
 
@@ -245,7 +245,7 @@ fn a_checkpoint_is_written_by_one_process() {
     let folder = tempfile::tempdir().unwrap();
     let config = config(folder.path(), "x");
     let keeper = service_kit::files::take_over_file(&config.out).unwrap();
-    let error = format!("{:#}", train::run(&config, &mut StopIf(|_| false)).unwrap_err());
+    let error = format!("{:#}", run::run(&config, &mut StopIf(|_| false)).unwrap_err());
     let expected = format!("out: {}: expected one that no process keeps, got that of process ", config.out.display());
     assert!(error.starts_with(&expected), "{error}");
     drop(keeper);

@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 use std::num::NonZeroU16;
 use std::path::Path;
 use tempfile::TempDir;
-use trainer::versions::Versions;
+use trainer::publish::versions::Versions;
 use wire::checkpoint::{
     CheckpointAnnouncement, CheckpointChunkRequest, CheckpointManifest, ListVersionsRequest, PromoteVersionRequest,
     RollBackRequest,

@@ -11,7 +11,7 @@ use recording::Episode;
 use service_kit::SessionConfig;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::recordings::Recordings;
+use trainer::record::folder::Recordings;
 use wire::Image;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpisode, digest};
 use wire::sim::Variation;
@@ -104,7 +104,7 @@ pub async fn sessions(endpoint: &str) -> (Session, Session) {
 
 /// Every recording of a folder, as bytes by path below it.
 pub fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
-    let paths = trainer::recordings::paths(folder).unwrap();
+    let paths = trainer::record::folder::paths(folder).unwrap();
     let name = |path: &Path| path.strip_prefix(folder).unwrap().display().to_string();
     paths.iter().map(|path| (name(path), std::fs::read(path).unwrap())).collect()
 }
@@ -113,9 +113,9 @@ pub fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
 pub async fn record(
     session: &Session,
     folder: &Path,
-    limits: trainer::ingest::Limits,
-) -> (trainer::recorder::Recorder, Arc<Recordings>) {
+    limits: trainer::record::ingest::Limits,
+) -> (trainer::record::Recorder, Arc<Recordings>) {
     let recordings = Arc::new(Recordings::open(folder.to_owned()).unwrap());
-    let ingest = Arc::new(trainer::ingest::Ingest::new(Arc::clone(&recordings), limits));
-    (trainer::recorder::start(session, Arc::clone(&recordings), ingest).await.unwrap(), recordings)
+    let ingest = Arc::new(trainer::record::ingest::Ingest::new(Arc::clone(&recordings), limits));
+    (trainer::record::start(session, Arc::clone(&recordings), ingest).await.unwrap(), recordings)
 }

@@ -1,6 +1,6 @@
 //! Reads a whole dataset and says what is in it and what is wrong with it.
 
-use crate::recordings::{self, dataset_digest};
+use crate::record::folder::{self, dataset_digest};
 use anyhow::Context;
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
 use rayon::prelude::*;
@@ -54,10 +54,10 @@ struct Facts {
 /// # Errors
 /// If the folder cannot be read; what is wrong inside it is in the report.
 pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Report> {
-    let paths = recordings::paths(folder)?;
+    let paths = folder::paths(folder)?;
     let read: Vec<_> = paths.par_iter().map(|path| facts(folder, path)).collect();
     let mut by_task: BTreeMap<String, Vec<Facts>> =
-        recordings::tasks(folder)?.into_iter().map(|task| (task, Vec::new())).collect();
+        folder::tasks(folder)?.into_iter().map(|task| (task, Vec::new())).collect();
     let mut faults = Vec::new();
     for (path, facts) in paths.iter().zip(read) {
         match facts {
@@ -69,7 +69,7 @@ pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Repor
             Err(fault) => faults.push(format!("{fault:#} (remove the file and record it again)")),
         }
     }
-    faults.extend(recordings::duplicates(&paths));
+    faults.extend(folder::duplicates(&paths));
     if by_task.len() < tasks {
         faults.push(format!("expected at least {tasks} tasks, got {}", by_task.len()));
     }
@@ -92,7 +92,7 @@ pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Repor
 }
 
 fn facts(folder: &Path, path: &Path) -> anyhow::Result<Facts> {
-    let episode = recordings::read(folder, path)?;
+    let episode = folder::read(folder, path)?;
     let bytes = path.metadata().with_context(|| path.display().to_string())?.len();
     let actions: Vec<_> = episode.steps().iter().filter_map(|step| step.action.as_ref()).collect();
     Ok(Facts {

@@ -1,6 +1,6 @@
 //! One step of the outer loop: loss, gradient, update.
 
-use crate::adam::Adam;
+use crate::training::adam::Adam;
 use anyhow::ensure;
 use cpn::loss::{Batch, OuterLoss};
 use cpn::{Agent, Recipe};

@@ -1,6 +1,6 @@
 //! The other side of the service's training runs: asking for them, and watching them on a terminal.
 
-use crate::progress::{Bar, Observer};
+use crate::training::progress::{Bar, Observer};
 use anyhow::{Context, anyhow};
 use backon::{ConstantBuilder, Retryable};
 use std::time::Duration;

@@ -1,11 +1,11 @@
 //! Training runs without a transport: starting them as processes, stopping, listing and watching them.
 //!
-//! A run has a folder, with its settings, its state, its log and its [`crate::journal`]. The state outlasts the service: a
+//! A run has a folder, with its settings, its state, its log and its [`crate::training::journal`]. The state outlasts the service: a
 //! run that was under way when the service ended is interrupted, and goes on from where it saved its state when it is
 //! started again.
 
-use crate::run_process::{self, End};
-use crate::{config, journal};
+use crate::runs::process::{self, End};
+use crate::training::{config, journal};
 use futures::{Stream, stream};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
@@ -244,7 +244,7 @@ impl Runs {
             });
         };
         let (file, log) = (folder.join(SETTINGS), folder.join(LOG));
-        let end = run_process::run(&self.config.program, &file, &log, &stop, hear).await;
+        let end = process::run(&self.config.program, &file, &log, &stop, hear).await;
         run.progress = self.get(&run.name).ok().and_then(|run| run.progress);
         run.state = match end {
             End::Finished { digest } => RunState::Finished { digest },

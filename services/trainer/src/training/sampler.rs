@@ -1,7 +1,7 @@
 //! Which samples a training run sees, in which order, towards which goals: a function of the data, the recipe and the seed.
 
-use crate::augment::Look;
-use crate::dataset::{Dataset, Episode};
+use crate::training::augment::Look;
+use crate::training::dataset::{Dataset, Episode};
 use cpn::loss::Batch;
 use cpn::recipe::{GoalSampling, Recipe, Training};
 use cpn::{Frames, images};

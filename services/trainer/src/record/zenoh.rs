@@ -1,8 +1,8 @@
 //! The recorder over zenoh: takes in streams, tells what it keeps, and sends it again to whoever asks.
 
-use crate::ingest::{Commit, Ingest};
 use crate::queries::serve;
-use crate::recordings::Recordings;
+use crate::record::folder::Recordings;
+use crate::record::ingest::{Commit, Ingest};
 use std::sync::Arc;
 use tracing::warn;
 use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse};

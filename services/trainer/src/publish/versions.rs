@@ -3,8 +3,8 @@
 //! `<model>.safetensors` is what a run wrote last, `<model>.safetensors.sig` its signature, if it has one; `versions/<model>`
 //! is the model's history.
 
-use crate::history::{self, History};
-use crate::signature;
+use crate::publish::history::{self, History};
+use crate::publish::signature;
 use anyhow::Context;
 use service_kit::files;
 use std::collections::{BTreeMap, HashMap};

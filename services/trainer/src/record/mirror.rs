@@ -1,7 +1,7 @@
 //! A late joiner: fetches what other recorders keep, then follows them, for good or until there is enough to train on.
 
-use crate::recordings::Recordings;
-use crate::replay::{is_passing, patience};
+use crate::record::folder::Recordings;
+use crate::record::send::{is_passing, patience};
 use backon::Retryable;
 use recording::Episode;
 use std::collections::BTreeMap;

@@ -5,8 +5,8 @@
 //! by committing, and a stream can be sent again without harm. What is lost on the way, or dropped because too many
 //! episodes are under way, is missing at the next commit, and so is never lost for good.
 
-use crate::frame;
-use crate::recordings::Recordings;
+use crate::record::folder::Recordings;
+use crate::record::frame;
 use recording::Episode;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

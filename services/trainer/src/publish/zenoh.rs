@@ -1,9 +1,9 @@
 //! Publishing over zenoh: planners are told which version of each model to serve and fetch it piece by piece; people list,
 //! promote and roll back.
 
+use crate::publish::versions::Versions;
 use crate::queries;
 use crate::service::CHANGES;
-use crate::versions::Versions;
 use anyhow::anyhow;
 use backon::{ConstantBuilder, Retryable};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};

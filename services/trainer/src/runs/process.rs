@@ -1,7 +1,7 @@
 //! The process of a training run: starting it, hearing of its progress, stopping it.
 
-use crate::progress::Progress;
-use crate::train::Outcome;
+use crate::training::progress::Progress;
+use crate::training::run::Outcome;
 use futures::StreamExt;
 use rustix::process::{Pid, Signal, kill_process};
 use serde::Deserialize;

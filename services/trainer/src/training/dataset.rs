@@ -1,7 +1,7 @@
 //! The demonstrations of a training run, in memory: every frame as bytes or as a position, side by side.
 
-use crate::frame;
-use crate::recordings::{self, dataset_digest};
+use crate::record::folder::{self, dataset_digest};
+use crate::record::frame;
 use anyhow::{Context, bail, ensure};
 use cpn::{Frames, Input, images};
 use rayon::prelude::*;
@@ -43,15 +43,15 @@ impl Dataset {
     /// size of their actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
     /// pen than meant.
     pub fn load(folder: &Path, held_out: &[String], input: Input) -> anyhow::Result<Self> {
-        let all_tasks = recordings::tasks(folder)?;
+        let all_tasks = folder::tasks(folder)?;
         for task in held_out {
             ensure!(all_tasks.contains(task), "hold_out: expected some of {all_tasks:?}, got {task:?}");
         }
         let held_out: Vec<_> = held_out.iter().map(|task| folder.join(task)).collect();
-        let mut paths = recordings::paths(folder)?;
+        let mut paths = folder::paths(folder)?;
         paths.retain(|path| !held_out.iter().any(|task| path.starts_with(task)));
         ensure!(!paths.is_empty(), "{}: expected demonstrations, got none", folder.display());
-        if let Some(duplicate) = recordings::duplicates(&paths).into_iter().next() {
+        if let Some(duplicate) = folder::duplicates(&paths).into_iter().next() {
             bail!(duplicate);
         }
         // The headers tell how much room everything takes; then each core fills in episodes.
@@ -161,7 +161,7 @@ fn fill<T: Send>(
     copy: impl Fn(&Recording, &mut [T]) -> anyhow::Result<()> + Sync,
 ) -> anyhow::Result<Vec<(Vec<f32>, usize)>> {
     let read = |(slot, path): (&mut [T], &PathBuf)| {
-        let episode = recordings::read(folder, path)?;
+        let episode = folder::read(folder, path)?;
         copy(&episode, slot).with_context(|| path.display().to_string())?;
         let actions: Vec<f32> = episode.steps().iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
         let size = actions.len() / (episode.steps().len() - 1);

@@ -1,6 +1,6 @@
 //! Sends recordings: the steps that a worker sent, as far as a recorder lacks them.
 
-use crate::recordings;
+use crate::record::folder;
 use anyhow::{Context, bail, ensure};
 use backon::{ExponentialBuilder, Retryable};
 use recording::Episode;
@@ -20,7 +20,7 @@ const COMMIT_TIMEOUT: Duration = Duration::from_secs(10);
 /// # Errors
 /// If a recording is damaged, two have one id, a task has none, a recorder refuses one, or none answers for two minutes.
 pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::Result<()> {
-    let all_tasks = recordings::tasks(folder)?;
+    let all_tasks = folder::tasks(folder)?;
     for task in tasks {
         ensure!(all_tasks.contains(task), "tasks: expected some of {all_tasks:?}, got {task:?}");
     }
@@ -28,14 +28,14 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
         tasks.is_empty()
             || path.parent().and_then(Path::file_name).is_some_and(|name| tasks.iter().any(|t| name == &**t))
     };
-    let paths: Vec<_> = recordings::paths(folder)?.into_iter().filter(|path| wanted(path)).collect();
-    if let Some(duplicate) = recordings::duplicates(&paths).into_iter().next() {
+    let paths: Vec<_> = folder::paths(folder)?.into_iter().filter(|path| wanted(path)).collect();
+    if let Some(duplicate) = folder::duplicates(&paths).into_iter().next() {
         bail!(duplicate);
     }
     let mut sent = 0;
     for path in paths {
         let (place, reading) = (folder.to_owned(), path.clone());
-        let episode = tokio::task::spawn_blocking(move || recordings::read(&place, &reading)).await??;
+        let episode = tokio::task::spawn_blocking(move || folder::read(&place, &reading)).await??;
         send(session, &episode).await.with_context(|| path.display().to_string())?;
         sent += 1;
     }

@@ -1,11 +1,11 @@
 //! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
 
-use crate::adam::Adam;
-use crate::config::Config;
-use crate::dataset::Dataset;
-use crate::learner::Learner;
-use crate::progress::{Meter, Observer};
-use crate::sampler::Sampler;
+use crate::training::adam::Adam;
+use crate::training::config::Config;
+use crate::training::dataset::Dataset;
+use crate::training::learner::Learner;
+use crate::training::progress::{Meter, Observer};
+use crate::training::sampler::Sampler;
 use anyhow::{Context, ensure};
 use cpn::Recipe;
 use cpn::archive::{self, Tensors};

@@ -1,9 +1,9 @@
 //! What a run leaves in its folder: `progress.jsonl`, a TensorBoard event file with the same values, and `curve.svg`.
 
-use crate::curve;
-use crate::progress::{Observer, Progress, ends_epoch};
-use crate::tensorboard::EventWriter;
-use crate::train;
+use crate::training::curve;
+use crate::training::progress::{Observer, Progress, ends_epoch};
+use crate::training::run;
+use crate::training::tensorboard::EventWriter;
 use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
@@ -108,7 +108,7 @@ fn own(folder: &Path, checkpoint: &Path) -> anyhow::Result<()> {
         return Ok(());
     }
     ensure!(
-        !owner.exists() && !owner.with_extension(train::RESUME).exists(),
+        !owner.exists() && !owner.with_extension(run::RESUME).exists(),
         "run_dir: expected a folder of {}, got {}, which is that of {}: give each run its own",
         checkpoint.display(),
         folder.display(),

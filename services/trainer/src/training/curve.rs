@@ -1,7 +1,7 @@
 //! The learning curve of a run as a picture.
 
-use crate::journal::Entry;
-use crate::progress::Progress;
+use crate::training::journal::Entry;
+use crate::training::progress::Progress;
 use anyhow::anyhow;
 use plotters::coord::Shift;
 use plotters::prelude::*;
