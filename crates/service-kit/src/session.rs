@@ -37,17 +37,17 @@ const MAX_MESSAGE_BYTES: usize = 66 << 20;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {
-    /// Talks to other peers directly; they find each other by gossip.
+    /// Direct connections to other peers, found by gossip.
     #[default]
     Peer,
-    /// Talks through one router.
+    /// One connection, to a router.
     Client,
-    /// Passes on what others send.
+    /// Connections of others, between which it passes messages on.
     Router,
 }
 
-/// How a process joins the others. What is left empty is not serialised, so that it can stand in a layer of
-/// configuration and on a command line alike.
+/// Connection to the zenoh network. Empty fields are not serialised, so that it can stand in a layer of configuration and on a
+/// command line alike.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct SessionConfig {
@@ -68,11 +68,11 @@ pub struct SessionConfig {
     #[arg(long, env = "CPN_SHARED_MEMORY", value_parser = FalseyValueParser::new())]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub shared_memory: bool,
-    /// Prefix of every key, which keeps apart runs that share a network.
+    /// Prefix of every key, which separates runs that share a network.
     #[arg(long, env = "CPN_NAMESPACE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub namespace: Option<String>,
-    /// Zenoh's own configuration file, in place of the defaults here; options that are given win over it.
+    /// Zenoh configuration file, in place of the defaults here; options on the command line win over it.
     #[arg(long, env = "ZENOH_CONFIG", value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zenoh_config: Option<PathBuf>,
@@ -84,11 +84,11 @@ pub struct SessionConfig {
     #[arg(long, env = "CPN_PASSWORD_FILE", value_name = "FILE", requires = "user")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub password_file: Option<PathBuf>,
-    /// Certificate authority of everybody in the network, in PEM.
+    /// Certificate of the network's authority, in PEM.
     #[arg(long, env = "CPN_TLS_CA", value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_ca: Option<PathBuf>,
-    /// Certificate of this process, in PEM, for all that it connects to and listens on.
+    /// Certificate of this process, in PEM, for connections of either direction.
     #[arg(long, env = "CPN_TLS_CERTIFICATE", value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_certificate: Option<PathBuf>,
@@ -100,7 +100,7 @@ pub struct SessionConfig {
     #[arg(long, env = "CPN_TLS_CRL", value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_crl: Option<PathBuf>,
-    /// Allows listening beyond the loopback interface without TLS.
+    /// Listen beyond the loopback interface without TLS.
     #[arg(long, env = "CPN_INSECURE", value_parser = FalseyValueParser::new())]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub insecure: bool,

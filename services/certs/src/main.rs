@@ -34,9 +34,10 @@ struct Folder {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Make what is missing: an authority, an identity for each role, the router's configuration. Renew what expires soon.
+    /// Make an authority, a certificate for each role and the router's configuration, as far as they are missing; renew certificates
+    /// that expire soon.
     Init {
-        /// Names and addresses under which services are reached.
+        /// Host names and addresses of the services, separated by commas.
         #[arg(long, value_delimiter = ',')]
         host: Vec<String>,
         /// Namespaces that the router lets through [default: keys without a namespace].
@@ -45,28 +46,28 @@ enum Command {
     },
     /// Issue a certificate.
     Issue {
-        /// Whom for.
+        /// Identity, ROLE or ROLE.NAME.
         identity: String,
-        /// Names and addresses under which it is reached, if it serves.
+        /// Host names and addresses of the service, separated by commas.
         #[arg(long, value_delimiter = ',')]
         host: Vec<String>,
     },
-    /// Renew certificates; without a name, those of which less than a third of the time is left.
+    /// Renew certificates.
     Renew {
-        /// Whose.
+        /// Identities [default: those with less than a third of their lifetime left].
         identities: Vec<String>,
     },
     /// Revoke an identity with all its certificates and tokens, for good.
     Revoke {
-        /// Whom.
+        /// Identity, ROLE or ROLE.NAME.
         identity: String,
     },
-    /// Issue a token, for clients of gRPC, openpi and metrics that have no certificate. It is printed, and kept nowhere.
+    /// Issue a token, for clients of gRPC, openpi and metrics without a certificate. It is printed once, and kept nowhere.
     Token {
-        /// Whom for.
+        /// Identity, ROLE or ROLE.NAME.
         identity: String,
     },
-    /// List every identity.
+    /// List all identities.
     List,
 }
 

@@ -5,52 +5,51 @@ use clap::{Args, Parser, Subcommand, value_parser};
 use service_kit::SessionConfig;
 use std::path::PathBuf;
 
-/// Measures first-attempt success in closed loop, and reports it.
+/// Evaluator: first-attempt success rates in closed loop, with confidence intervals.
 #[derive(Debug, Parser)]
 #[command(name = "cpn-eval", version)]
 pub struct Cli {
-    /// What to do.
+    /// Subcommand.
     #[command(subcommand)]
     pub command: Command,
 }
 
-/// What to do.
+/// Subcommands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Run every model on every variation of every task, then report; trials that the folder already holds are kept.
+    /// Run every model on every variation of every task, then report; the same command resumes an interrupted run.
     Run(Box<RunArgs>),
-    /// Report again from the records of a run.
+    /// Report again from the records of an evaluation.
     Report(ReportArgs),
-    /// Ask a planner again for every plan of a recorded episode, and compare the answers bit for bit.
+    /// Replay a recorded episode's plan requests, and compare the plans bit for bit.
     Replay(Box<ReplayArgs>),
 }
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, Args)]
 pub struct RunArgs {
-    /// Names of the planners, all with the same checkpoints; trials are spread over those that are alive.
+    /// Names of the planners, separated by commas; all serve the same checkpoints and share the trials.
     #[arg(long, value_delimiter = ',', default_value = "planner")]
     pub planner: Vec<String>,
-    /// Simulator workers to wait for; all that are alive are used.
+    /// Minimum number of simulator workers; all that are alive are used.
     #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
     pub workers: u32,
-    /// Models to compare; every model of the planner if not given.
+    /// Models to compare, separated by commas [default: every model of the planner].
     #[arg(long, value_delimiter = ',')]
     pub models: Vec<String>,
-    /// Tasks to evaluate on.
+    /// Tasks to evaluate on, separated by commas.
     #[arg(long, value_delimiter = ',', required = true)]
     pub tasks: Vec<String>,
-    /// Variations of each task.
+    /// Number of trials of each task, each of another variation.
     #[arg(long, default_value_t = 20, value_parser = value_parser!(u32).range(1..=100_000))]
     pub trials: u32,
-    /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations, and the report
-    /// says so.
+    /// Seed of the first variation; the others follow it. Seeds below 1000000 belong to demonstrations, which the report mentions.
     #[arg(long, default_value_t = FIRST_EVALUATION_SEED, value_parser = value_parser!(u64).range(..1 << 47))]
     pub first_seed: u64,
-    /// Whose end the goal picture shows. Another variation's is an ablation, and the report says so.
+    /// Variation whose end the goal image shows. Another one than the trial's is an ablation, which the report mentions.
     #[arg(long, value_enum, default_value_t = GoalSource::SameVariation)]
     pub goal: GoalSource,
-    /// Folder of the records and the report.
+    /// Folder of records and report.
     #[arg(long)]
     pub out: PathBuf,
     /// Title of the report.
@@ -59,14 +58,13 @@ pub struct RunArgs {
     /// Print the summary as JSON instead of a table.
     #[arg(long)]
     pub json: bool,
-    /// Limit of an answer by a planner or worker.
+    /// Timeout of a request to a planner or worker, in seconds.
     #[arg(long, default_value_t = 10, value_parser = value_parser!(u64).range(1..=3600))]
     pub timeout_secs: u64,
-    /// Time in which a lost router, planner or worker may come back for a trial to go on; after it the trial begins anew.
+    /// Time for a lost router, planner or worker to come back, in seconds; after it the trial restarts from its seed.
     #[arg(long, default_value_t = 30, value_parser = value_parser!(u64).range(..=3600))]
     pub recovery_secs: u64,
-    /// Limit of the wait for router, planners and workers, and for planners to serve the same models, at the start and whenever no
-    /// planner or no worker is left.
+    /// Timeout of the wait for router, planners, workers and models, in seconds: at the start, and whenever none is left.
     #[arg(long, default_value_t = 60, value_parser = value_parser!(u64).range(1..=86_400))]
     pub wait_secs: u64,
     /// Connection to the planners and the workers.
@@ -77,7 +75,7 @@ pub struct RunArgs {
 /// Arguments of `report`.
 #[derive(Debug, Clone, Args)]
 pub struct ReportArgs {
-    /// Folder of the records and the report.
+    /// Folder of records and report.
     #[arg(long)]
     pub out: PathBuf,
     /// Print the summary as JSON instead of a table.
@@ -88,12 +86,12 @@ pub struct ReportArgs {
 /// Arguments of `replay`.
 #[derive(Debug, Clone, Args)]
 pub struct ReplayArgs {
-    /// The episode: an MCAP file beside the record of a trial.
+    /// Recorded episode: an MCAP file beside the record of a trial.
     pub file: PathBuf,
-    /// Name of the planner to ask.
+    /// Name of the planner.
     #[arg(long, default_value = "planner")]
     pub planner: String,
-    /// How to join the planner.
+    /// Connection to the planner.
     #[command(flatten)]
     pub session: SessionConfig,
 }

@@ -15,9 +15,9 @@ class ServeConfig:
     """Serve Meta-World's and Jenga's tasks over zenoh until SIGTERM or SIGINT."""
 
     worker: str = "w0"
-    """Name of this worker in its keys."""
+    """Name of the worker in its zenoh keys."""
     max_steps: int = 150
-    """Steps after which an unsolved episode ends."""
+    """Maximum number of steps of an episode."""
     zenoh: ZenohConfig = field(default_factory=ZenohConfig)
 
     def __post_init__(self) -> None:
@@ -36,11 +36,11 @@ class DemonstrateConfig:
 
     tasks: tuple[str, ...] = TASKS
     episodes: int = 25
-    """Successful episodes per task."""
+    """Number of successful episodes of each task."""
     first_seed: int = 0
-    """Seed of the first try. Each failure of the expert moves on to the next seed."""
+    """Seed of the first variation; the next seed follows after each episode, solved or not."""
     processes: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
-    """Processes that share the tasks."""
+    """Number of processes, which share the tasks."""
     zenoh: ZenohConfig = field(default_factory=ZenohConfig)
 
     def __post_init__(self) -> None:

@@ -106,8 +106,8 @@ class ZenohConfig:
     """Joining a zenoh network. Environment variables stand in for options that are not given."""
 
     mode: Mode | None = field(default_factory=_from_environment("CPN_MODE", _mode, None))
-    """Role: a peer (the default) talks to other peers directly, a client through one router, and a router passes on
-    what others send. CPN_MODE."""
+    """Zenoh mode: peer (the default) connects to other peers directly, client to one router, router passes messages
+    on. CPN_MODE."""
     connect: tuple[str, ...] = field(default_factory=_from_environment("CPN_CONNECT", _split, ()))
     """Endpoints to connect to, for example tcp/127.0.0.1:7447 or tls/router:7447. Peers that share one find each other
     by gossip. CPN_CONNECT, separated by commas."""
@@ -115,22 +115,22 @@ class ZenohConfig:
     """Endpoints to listen on; by default any free port of the loopback interface, and none for a client. CPN_LISTEN,
     separated by commas."""
     namespace: Text = field(default_factory=_from_environment("CPN_NAMESPACE", str, None))
-    """Prefix of every key, which keeps apart runs that share a network. CPN_NAMESPACE."""
+    """Prefix of every key, which separates runs that share a network. CPN_NAMESPACE."""
     zenoh_config: File = field(default_factory=_from_environment("ZENOH_CONFIG", Path, None))
-    """Zenoh's own configuration file (.json5, .json or .yaml), in place of the defaults here; options that are given
-    win over it. ZENOH_CONFIG."""
+    """Zenoh configuration file (.json5, .json or .yaml), in place of the defaults here; options on the command line win
+    over it. ZENOH_CONFIG."""
     user: Text = field(default_factory=_from_environment("CPN_USER", str, None))
     """User name for routers that ask for one. CPN_USER."""
     password_file: File = field(default_factory=_from_environment("CPN_PASSWORD_FILE", Path, None))
     """File with the user's password. CPN_PASSWORD_FILE."""
     tls_ca: File = field(default_factory=_from_environment("CPN_TLS_CA", Path, None))
-    """Certificate authority of everybody in the network, in PEM. CPN_TLS_CA."""
+    """Certificate of the network's authority, in PEM. CPN_TLS_CA."""
     tls_certificate: File = field(default_factory=_from_environment("CPN_TLS_CERTIFICATE", Path, None))
-    """Certificate of this process, in PEM, for its tls/ endpoints of both directions. CPN_TLS_CERTIFICATE."""
+    """Certificate of this process, in PEM, for connections of either direction. CPN_TLS_CERTIFICATE."""
     tls_private_key: File = field(default_factory=_from_environment("CPN_TLS_PRIVATE_KEY", Path, None))
     """Private key of the certificate, in PEM. CPN_TLS_PRIVATE_KEY."""
     insecure: bool = field(default_factory=_from_environment("CPN_INSECURE", _boolean, False))
-    """Allows listening beyond the loopback interface without TLS. CPN_INSECURE."""
+    """Listen beyond the loopback interface without TLS. CPN_INSECURE."""
 
     def __post_init__(self) -> None:
         for name in ("connect", "listen"):

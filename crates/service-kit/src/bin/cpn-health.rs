@@ -16,19 +16,19 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 use tower::service_fn;
 
-/// Ask a planner or trainer for its health. The exit code is 0 if it serves, 1 otherwise.
+/// Health check of a planner or trainer: exit code 0 if it serves, 1 otherwise.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Args {
     /// Address of gRPC, for example 127.0.0.1:50051.
     address: String,
-    /// Service to ask for: the whole server if empty, `zenoh` for the connection to the network.
+    /// Part of the service: all of it if empty, `zenoh` for the connection to the network.
     #[arg(long, default_value = "")]
     service: String,
     /// Host in the server's certificate [default: that of the address].
     #[arg(long)]
     server_name: Option<String>,
-    /// Time to answer, in seconds.
+    /// Timeout of the answer, in seconds.
     #[arg(long, default_value_t = 5)]
     timeout_secs: u64,
     #[command(flatten)]
