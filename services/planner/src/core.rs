@@ -82,12 +82,11 @@ impl PlannerCore {
         self.thread.plan(self.task(request)?).await
     }
 
-    /// The same for who awaits nothing: `reply` is called with the answer, on a thread that it may block. Whoever calls keeps the
-    /// deadline of a plan that is being made.
+    /// Callback form of `plan`: `reply` is called once, on a thread that it may block.
     pub(crate) fn plan_then(&self, request: PlanRequest, reply: impl FnOnce(Answer) + Send + 'static) {
         match self.task(request) {
-            Ok(task) => self.thread.enqueue_then(task, Box::new(reply)),
-            Err(error) => self.thread.call(Box::new(reply), error),
+            Ok(task) => self.thread.plan_then(task, reply),
+            Err(error) => self.thread.outbox().put(move || reply(Err(error))),
         }
     }
 

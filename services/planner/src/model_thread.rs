@@ -15,6 +15,7 @@ use std::time::Instant;
 use std::{fmt, io, thread};
 use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
+use tokio_util::task::AbortOnDropHandle;
 use tracing::{debug_span, warn};
 use wire::Error;
 use wire::planner::ModelInfo;
@@ -92,9 +93,28 @@ impl ModelThread {
         answer.map_err(|_| stopped())?
     }
 
+    /// Callback form of `plan`: `reply` is called once, by the model's thread or when the deadline passes. It may block.
+    pub(crate) fn plan_then(&self, task: PlanTask, reply: impl FnOnce(Answer) + Send + 'static) {
+        let outbox = self.outbox.clone();
+        let Some(deadline) = task.deadline else {
+            return self.enqueue(task, Reply::Called(Box::new(reply), outbox));
+        };
+        let pending = PendingReply(Arc::new(Mutex::new(Some(reply))));
+        let (late, late_outbox) = (pending.clone(), outbox.clone());
+        let clock = AbortOnDropHandle::new(self.relay.runtime.spawn(async move {
+            tokio::time::sleep(deadline).await;
+            late_outbox.put(move || late.send(Err(too_late(deadline))));
+        }));
+        let planned = move |answer| {
+            pending.send(answer);
+            drop(clock);
+        };
+        self.enqueue(task, Reply::Called(Box::new(planned), outbox));
+    }
+
     /// Puts a task in the queue, or replies at once: if the queue is full, or so long that the deadline would pass, or the
     /// thread has stopped.
-    pub(crate) fn enqueue(&self, task: PlanTask, reply: Reply) {
+    fn enqueue(&self, task: PlanTask, reply: Reply) {
         let enqueued = Instant::now();
         let (place, estimate) = match self.admit(&task) {
             Ok(admitted) => admitted,
@@ -111,19 +131,9 @@ impl ModelThread {
         }
     }
 
-    /// The same for what is called with the answer, and may block.
-    pub(crate) fn enqueue_then(&self, task: PlanTask, call: Box<dyn FnOnce(Answer) + Send>) {
-        self.enqueue(task, Reply::Called(call, self.outbox.clone()));
-    }
-
     /// For what may block.
     pub(crate) fn outbox(&self) -> Outbox {
         self.outbox.clone()
-    }
-
-    /// Calls it with an error at once.
-    pub(crate) fn call(&self, call: Box<dyn FnOnce(Answer) + Send>, error: Error) {
-        Reply::Called(call, self.outbox.clone()).send(Err(error));
     }
 
     /// Has a job done that is no plan.
@@ -201,6 +211,24 @@ impl ModelThread {
                 }
             }
         }
+    }
+}
+
+/// A reply that two would give, the model's thread and the clock: the first does.
+struct PendingReply<F>(Arc<Mutex<Option<F>>>);
+
+impl<F: FnOnce(Answer)> PendingReply<F> {
+    fn send(&self, answer: Answer) {
+        let reply = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(reply) = reply {
+            reply(answer);
+        }
+    }
+}
+
+impl<F> Clone for PendingReply<F> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
     }
 }
 

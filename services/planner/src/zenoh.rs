@@ -4,11 +4,11 @@ use crate::CHANGES;
 use crate::config::Config;
 use crate::core::PlannerCore;
 use crate::follow::Follower;
-use crate::task::{Answer, queue_full, too_late};
+use crate::task::{Answer, queue_full};
 use anyhow::{anyhow, ensure};
 use service_kit::session::{self, Connection, SessionConfig};
 use std::future::{Future, ready};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::{AbortOnDropHandle, TaskTracker};
@@ -147,7 +147,7 @@ impl Requests {
     /// model's thread sends the answer: a client that is alone would wait for every thread that had to be woken in between. All
     /// else is sent by threads that may block, as zenoh does for clients that do not read.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
-        let (core, tasks, runtime) = (self.core.clone(), self.tasks.clone(), self.runtime.clone());
+        let (core, tasks) = (self.core.clone(), self.tasks.clone());
         let (places, capacity, outbox) = (Arc::clone(&self.plans), self.capacity, core.outbox());
         let own = Arc::new(key.clone());
         let callback = move |mut query: Query| {
@@ -159,30 +159,14 @@ impl Requests {
             let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
             // What waits to be sent may be much, and needs it no longer.
             query.payload_mut().into_iter().for_each(|payload| *payload = ZBytes::new());
-            let deadline = request.as_ref().ok().and_then(|request| request.deadline);
-            // The model's thread and the clock both want to answer; the first does.
-            let waiting = Arc::new(Mutex::new(Some((query, tasks.token(), place))));
+            let in_flight = tasks.token();
             let answer = move |plan: Answer| {
-                let waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner).take();
-                if let Some((query, _in_flight, _place)) = waiting {
-                    reply(&query, &own, plan);
-                }
-            };
-            let clock = deadline.map(|deadline| {
-                let answer = answer.clone();
-                let outbox = outbox.clone();
-                AbortOnDropHandle::new(runtime.spawn(async move {
-                    tokio::time::sleep(deadline).await;
-                    outbox.put(move || answer(Err(too_late(deadline))));
-                }))
-            });
-            let planned = move |plan| {
-                answer(plan);
-                drop(clock);
+                reply(&query, &own, plan);
+                drop((in_flight, place));
             };
             match request {
-                Ok(request) => span.in_scope(|| core.plan_then(request, planned)),
-                Err(error) => outbox.put(move || planned(Err(error))),
+                Ok(request) => span.in_scope(|| core.plan_then(request, answer)),
+                Err(error) => outbox.put(move || answer(Err(error))),
             }
         };
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
