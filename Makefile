@@ -10,6 +10,8 @@ OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
 COMPOSE ?= docker-compose
+# All code in Python, as seen from sim-worker, whose settings hold for it.
+PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tests/kubernetes tests/openpi tests/stack)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
@@ -121,7 +123,7 @@ test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, with
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
 	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-fuzz: system .libtorch/build-version ## Feed the decoders what a stranger may send, ten minutes each (MINUTES=n); an input that breaks one fails it
+fuzz: system .libtorch/build-version ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
 	scripts/fuzz.sh
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
@@ -144,13 +146,13 @@ lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cd fuzz && cargo fmt --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
-	cd sim-worker && $(UV) run --quiet ruff check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack && $(UV) run --quiet ruff format --check . ../examples ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack && $(UV) run --quiet basedpyright
+	cd sim-worker && $(UV) run --quiet ruff check $(PYTHON) && $(UV) run --quiet ruff format --check $(PYTHON) && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
 	cd fuzz && cargo fmt
-	cd sim-worker && $(UV) run --quiet ruff format . ../benches ../experiments ../export ../tests/openpi ../tests/kubernetes ../tests/stack
+	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
 	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) .libtorch

@@ -8,6 +8,6 @@ for fuzzer in messages checkpoint recording openpi signature; do
     echo "== $fuzzer"
     mkdir -p "artifacts/$fuzzer"
     cargo run --quiet --release --locked --bin "$fuzzer" -- "corpus/$fuzzer" -artifact_prefix="artifacts/$fuzzer/" \
-        -max_total_time=$((${MINUTES:-10} * 60)) -timeout=10 -rss_limit_mb=1024 -print_final_stats=1 || broken+=("$fuzzer")
+        -max_total_time="${FUZZ_SECONDS:-600}" -timeout=10 -rss_limit_mb=1024 -print_final_stats=1 || broken+=("$fuzzer")
 done
 [[ ${#broken[@]} -eq 0 ]] || { echo "broken: ${broken[*]}" >&2; exit 1; }

@@ -8,17 +8,21 @@ that a shared mistake is unlikely. Run it again only when the mathematics change
 
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch.func import grad
+from torch.nn import functional
+
+Weights = dict[str, torch.Tensor]
 
 LATENT, HIDDEN, GATE, ACTIONS, HORIZON, BATCH = 8, 6, 5, 4, 3, 2
 CONVOLUTIONS = [(4, 8, 8), (6, 4, 2)]  # channels, kernel, stride
 
 
 def dense_shapes(prefix: str, inputs: int, outputs: int, gated: bool) -> dict[str, tuple[int, ...]]:
+    """Shapes of a fully connected layer `[inputs] -> [outputs]`, with the two gates of a neuromodulated one."""
     shapes: dict[str, tuple[int, ...]] = {f"{prefix}.weight": (outputs, inputs), f"{prefix}.bias": (outputs,)}
     if gated:
         for gate, size in (("u", outputs * inputs), ("v", outputs)):
@@ -31,7 +35,8 @@ def dense_shapes(prefix: str, inputs: int, outputs: int, gated: bool) -> dict[st
     return shapes
 
 
-def make_weights(method: str) -> dict[str, torch.Tensor]:
+def make_weights(method: str) -> Weights:
+    """Random weights of a small model of the method, upn or cpn."""
     gated = method == "cpn"
     shapes: dict[str, tuple[int, ...]] = {"step_size": ()}
     channels, size = 3, 84
@@ -48,50 +53,58 @@ def make_weights(method: str) -> dict[str, torch.Tensor]:
     return {name: torch.randn(shape) * 0.3 for name, shape in shapes.items()}
 
 
-def dense(w: dict[str, torch.Tensor], prefix: str, x: torch.Tensor) -> torch.Tensor:
-    """y = (u(x) * a) x + v(x) * b for one sample, or a x + b where the layer has no gates."""
+def dense(w: Weights, prefix: str, x: torch.Tensor) -> torch.Tensor:
+    """Fully connected layer of one sample `[inputs]`: (u(x) * a) x + v(x) * b, or a x + b where it has no gates."""
     a, b = w[f"{prefix}.weight"], w[f"{prefix}.bias"]
     if f"{prefix}.u.hidden.weight" in w:
 
         def gate(name: str) -> torch.Tensor:
-            layer = lambda part, y: w[f"{prefix}.{name}.{part}.weight"] @ y + w[f"{prefix}.{name}.{part}.bias"]
+            def layer(part: str, y: torch.Tensor) -> torch.Tensor:
+                return w[f"{prefix}.{name}.{part}.weight"] @ y + w[f"{prefix}.{name}.{part}.bias"]
+
             return 1 / (1 + torch.exp(-layer("output", layer("hidden", x).clamp(min=0))))
 
         a, b = gate("u").reshape(a.shape) * a, gate("v") * b
     return torch.einsum("oi,i->o", a, x) + b
 
 
-def encode(w: dict[str, torch.Tensor], image: torch.Tensor) -> torch.Tensor:
+def encode(w: Weights, image: torch.Tensor) -> torch.Tensor:
+    """Embedding `[LATENT]` of an image `[84, 84, 3]` of bytes."""
     y = image.movedim(-1, 0)[None].double() / 255 - 0.5
     for i, (_, _, stride) in enumerate(CONVOLUTIONS):
-        y = F.conv2d(y, w[f"encoder.conv.{i}.weight"], w[f"encoder.conv.{i}.bias"], stride=stride).clamp(min=0)
+        y = functional.conv2d(y, w[f"encoder.conv.{i}.weight"], w[f"encoder.conv.{i}.bias"], stride=stride).clamp(min=0)
     x = w["encoder.linear.weight"] @ y.reshape(-1) + w["encoder.linear.bias"]
     centred = x - x.mean()
     return centred / (centred.square().mean() + 1e-5).sqrt() * w["encoder.norm.weight"] + w["encoder.norm.bias"]
 
 
-def features(w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+def features(w: Weights, x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    """Features `[HIDDEN]` of a state, and for CPN of the goal, both `[LATENT]`."""
     gated = "network.trunk.u.hidden.weight" in w
     return dense(w, "network.trunk", torch.cat([x, goal]) if gated else x).clamp(min=0)
 
 
-def policy(w: dict[str, torch.Tensor], h: torch.Tensor) -> torch.Tensor:
+def policy(w: Weights, h: torch.Tensor) -> torch.Tensor:
+    """Action `[ACTIONS]` from features."""
     return torch.tanh(dense(w, "network.policy_1", dense(w, "network.policy_0", h).clamp(min=0)))
 
 
-def step(w: dict[str, torch.Tensor], x: torch.Tensor, h: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+def step(w: Weights, x: torch.Tensor, h: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    """Next state `[LATENT]` from a state, its features and an action."""
     hidden = dense(w, "network.dynamics_0", torch.cat([h, action])).clamp(min=0)
     return x + dense(w, "network.dynamics_1", hidden)
 
 
-def inner_loss(actions: torch.Tensor, w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+def inner_loss(actions: torch.Tensor, w: Weights, x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    """Huber loss between the state after the actions `[HORIZON, ACTIONS]` and the goal, summed over the latent."""
     for action in actions:
         x = step(w, x, features(w, x, goal), action)
     error = (x - goal).abs()
     return torch.where(error < 1, 0.5 * error**2, error - 0.5).sum()
 
 
-def plan(w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor, updates: int):
+def plan(w: Weights, x: torch.Tensor, goal: torch.Tensor, updates: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Actions `[HORIZON, ACTIONS]` after the updates, and the inner loss before and after each, `[updates + 1]`."""
     actions, state = [], x
     for _ in range(HORIZON):
         h = features(w, state, goal)
@@ -105,34 +118,48 @@ def plan(w: dict[str, torch.Tensor], x: torch.Tensor, goal: torch.Tensor, update
     return actions, torch.stack(losses)
 
 
+class Batch(NamedTuple):
+    """Samples for one outer step."""
+
+    observations: torch.Tensor
+    """`[BATCH, 84, 84, 3]`."""
+    goals: torch.Tensor
+    """`[BATCH, 84, 84, 3]`."""
+    demonstrated: torch.Tensor
+    """Actions `[BATCH, HORIZON, ACTIONS]`."""
+    mask: torch.Tensor
+    """`[BATCH, HORIZON]`: 1 where there is a demonstrated action."""
+
+
+def outer_loss(w: Weights, batch: Batch, updates: int) -> torch.Tensor:
+    """Mean squared error of the planned actions, over those that were demonstrated."""
+    pairs = zip(batch.observations, batch.goals, strict=True)
+    planned = torch.stack([plan(w, encode(w, o), encode(w, g), updates)[0] for o, g in pairs])
+    squared = (planned - batch.demonstrated).square() * batch.mask[..., None]
+    return squared.sum() / (batch.mask.sum() * ACTIONS)
+
+
 def main() -> None:
+    """Writes a file for each of the two methods that plan."""
     torch.set_default_dtype(torch.float64)
     for method, updates in (("upn", 1), ("cpn", 2)):
         torch.manual_seed(7)
         weights = make_weights(method)
         observations, goals = torch.randint(0, 256, (2, BATCH, 84, 84, 3), dtype=torch.uint8)
         demonstrated = torch.rand(BATCH, HORIZON, ACTIONS) * 2 - 1
-        mask = torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+        batch = Batch(observations, goals, demonstrated, torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]]))
 
-        def outer_loss(w: dict[str, torch.Tensor]) -> torch.Tensor:
-            planned = [plan(w, encode(w, o), encode(w, g), updates)[0] for o, g in zip(observations, goals)]
-            squared = (torch.stack(planned) - demonstrated).square() * mask[..., None]
-            return squared.sum() / (mask.sum() * ACTIONS)
-
-        pairs = [(encode(weights, o), encode(weights, g)) for o, g in zip(observations, goals)]
+        pairs = [(encode(weights, o), encode(weights, g)) for o, g in zip(observations, goals, strict=True)]
         plans = [plan(weights, x, goal, updates) for x, goal in pairs]
-        gradients = grad(outer_loss)(weights)
+        gradients = grad(outer_loss)(weights, batch, updates)
         tensors = {f"weight.{k}": v for k, v in weights.items()} | {f"gradient.{k}": v for k, v in gradients.items()}
+        tensors |= batch._asdict()
         tensors |= {
-            "observations": observations,
-            "goals": goals,
-            "demonstrated": demonstrated,
-            "mask": mask,
             "x": torch.stack([x for x, _ in pairs]),
             "x_g": torch.stack([goal for _, goal in pairs]),
             "actions": torch.stack([actions for actions, _ in plans]),
             "inner_losses": torch.stack([losses for _, losses in plans], dim=1),
-            "outer_loss": outer_loss(weights),
+            "outer_loss": outer_loss(weights, batch, updates),
         }
         model = {
             "method": method,
