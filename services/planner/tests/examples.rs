@@ -1,4 +1,4 @@
-//! The README's examples are the files of the repository, and they work.
+//! The examples: README shows one as it is and links the others, and they work.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -10,12 +10,12 @@ use std::process::Command;
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
 
 #[test]
-fn the_readme_shows_the_examples_as_they_are() {
-    let readme = std::fs::read_to_string(Path::new(ROOT).join("README.md")).unwrap();
-    let files = ["plan_zenoh.py", "plan_grpc.py", "plan_openpi.py"].map(|file| format!("examples/{file}"));
-    for file in files.iter().map(String::as_str).chain(["services/planner/examples/plan.rs"]) {
-        let example = std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
-        assert!(readme.contains(&example), "README.md: expected the text of {file}");
+fn the_readme_shows_one_example_and_links_the_others() {
+    let read = |file| std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
+    let readme = read("README.md");
+    assert!(readme.contains(&read("examples/plan_zenoh.py")), "README.md: expected the text of examples/plan_zenoh.py");
+    for file in ["examples/plan_grpc.py", "examples/plan_openpi.py", "services/planner/examples/plan.rs"] {
+        assert!(!read(file).is_empty() && readme.contains(&format!("]({file})")), "README.md: expected a link to {file}");
     }
 }
 
