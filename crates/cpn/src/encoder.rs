@@ -1,7 +1,7 @@
 //! The encoder f_φ, shared by observation and goal (figure "encoder", a).
 
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
-use crate::{fused, images, positions};
+use crate::{engine, images, positions};
 use serde::{Deserialize, Serialize};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
@@ -20,7 +20,7 @@ pub enum Precision {
 impl Precision {
     /// The same, or float32 where the processor has no instructions for bfloat16.
     pub fn where_faster(self) -> Self {
-        if fused::bfloat16_is_fast() { self } else { Self::Float32 }
+        if engine::bfloat16_is_fast() { self } else { Self::Float32 }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::agent::Agent;
 use crate::encoder::Precision;
-use crate::fused::{self, Embedder, OuterLoop, Samples, Variables, floats};
+use crate::engine::{self, Embedder, OuterLoop, Samples, Variables, floats};
 use crate::method::Frames;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -42,11 +42,11 @@ pub struct Gradient {
     pub encoder_seconds: f64,
 }
 
-/// Differentiates outer losses without a graph ([`crate::fused`]).
+/// Differentiates outer losses without a graph ([`crate::engine`]).
 #[derive(Debug)]
 pub struct OuterLoss {
     embedder: Embedder<f32>,
-    fused: OuterLoop<f32>,
+    outer_loop: OuterLoop<f32>,
 }
 
 impl OuterLoss {
@@ -54,7 +54,7 @@ impl OuterLoss {
     pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
         Self {
             embedder: Embedder::new(agent.config().encoder.clone(), precision, threads),
-            fused: OuterLoop::new(agent.config().clone(), threads),
+            outer_loop: OuterLoop::new(agent.config().clone(), threads),
         }
     }
 
@@ -71,12 +71,12 @@ impl OuterLoss {
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
         let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
         let samples = Samples { x: &x, x_g: &x_g, actions: &actions, mask: &mask };
-        let outer = self.fused.run(&Variables(&variables), samples);
+        let outer = self.outer_loop.run(&Variables(&variables), samples);
 
         let mut hat = vec![0.0; embeddings.len()];
         for (indices, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
             for (at, gradient) in rows(indices).zip(gradient.chunks_exact(latent)) {
-                fused::add(&mut hat[at..at + latent], gradient);
+                engine::add(&mut hat[at..at + latent], gradient);
             }
         }
         let started = Instant::now();

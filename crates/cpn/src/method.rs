@@ -1,7 +1,7 @@
 //! The compared methods behind one interface (section "Methods for comparison").
 
 use crate::config::Input;
-use crate::fused::{Descent, Sampling};
+use crate::engine::{Descent, Sampling};
 use crate::{images, positions};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -7,7 +7,7 @@ mod common;
 use common::{double_agent, encoders, frames, noise_images, position_config, small_config, uniform};
 use cpn::config::ConvConfig;
 use cpn::encoder::Precision;
-use cpn::fused::{Embedder, OuterLoop, Samples, Weights};
+use cpn::engine::{Embedder, OuterLoop, Samples, Weights};
 use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, loss};
 use proptest::prelude::*;
 use std::collections::HashMap;

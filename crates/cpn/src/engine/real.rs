@@ -1,4 +1,4 @@
-//! The numbers that the fused core is written in: float32 to train with, float64 to check it by.
+//! The numbers that the engine is written in: float32 to train with, float64 to check it by.
 
 use super::factor::Factor;
 use super::lanes::Aligned;

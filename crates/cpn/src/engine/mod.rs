@@ -1,4 +1,4 @@
-//! The outer loss and its gradient without an autograd graph: the passes over g_θ are derived by hand and fused.
+//! The outer loss and its gradient without an autograd graph: the passes over g_θ are derived by hand.
 //!
 //! A training step differentiates through the inner loop, and so through a gradient. In terms of one layer y = f(x):
 //!
@@ -15,7 +15,7 @@
 //!
 //! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
 //! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
-//! ([`Embedder`]). Tested against autograd in float64 (`tests/fused.rs`).
+//! ([`Embedder`]). Tested against autograd in float64 (`tests/gradients.rs`).
 
 mod attenuated;
 mod convolution;
