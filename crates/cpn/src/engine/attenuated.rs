@@ -4,12 +4,14 @@
 //! The weights of one input lie together. Where a sample's x_i is what a rectified linear unit has closed, none of them matters,
 //! in no pass: x_i is zero, so is ẋ_i, and nobody asks for x̄_i.
 
+use crate::engine::simd::vector;
 use super::gate::{Gate, GateGradient, GateTape};
-use super::lanes::{Aligned, Lanes, grown, zeros};
 use super::linear::Weights;
 use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Tangent};
-use super::real::Real;
 use super::rectified::Open;
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::Element;
+use crate::engine::simd::vector::Vector;
 use super::sparse::Part;
 use pulp::{Arch, Simd};
 use std::ops::Range;
@@ -24,7 +26,7 @@ pub struct Attenuated<T> {
     /// The first of the inputs, which a rectified linear unit left.
     rectified: usize,
     /// a, `[I, O']`: filled up with zeros to whole registers.
-    pub a: Aligned<T>,
+    pub a: AlignedVec<T>,
     pub gate: Gate<T>,
 }
 
@@ -32,7 +34,7 @@ pub struct Attenuated<T> {
 #[derive(Debug)]
 pub struct AttenuatedGradient<T> {
     /// `[I, O']`.
-    pub a: Aligned<T>,
+    pub a: AlignedVec<T>,
     pub gate: GateGradient<T>,
 }
 
@@ -41,8 +43,8 @@ pub struct AttenuatedGradient<T> {
 pub struct AttenuatedTape<T> {
     /// Where x is not closed.
     open: Open,
-    u: Aligned<T>,
-    s_dot: Aligned<T>,
+    u: AlignedVec<T>,
+    s_dot: AlignedVec<T>,
     pub gate: GateTape<T>,
 }
 
@@ -50,19 +52,19 @@ pub struct AttenuatedTape<T> {
 #[derive(Debug)]
 pub struct Scratch<T> {
     /// ŝ and s̄ of a part.
-    s: Aligned<T>,
+    s: AlignedVec<T>,
     /// What the parts add to an adjoint of h.
-    sums: Aligned<T>,
+    sums: AlignedVec<T>,
 }
 
-impl<T: Real> Scratch<T> {
+impl<T: Element> Scratch<T> {
     /// None: it grows.
     pub fn new() -> Self {
         Self { s: zeros(0), sums: zeros(0) }
     }
 }
 
-impl<T: Real> Attenuated<T> {
+impl<T: Element> Attenuated<T> {
     /// Of a `[O, I]`, with the gate of a name in a checkpoint.
     pub fn new(a: &[T], outputs: usize, rectified: usize, gate: &str, weights: &impl Weights<T>) -> Self {
         let (inputs, gate) = (a.len() / outputs, Gate::named(gate, weights, outputs));
@@ -98,7 +100,7 @@ impl<T: Real> Attenuated<T> {
     /// Registers of O'.
     #[inline(always)]
     pub fn registers<S: Simd>(&self) -> usize {
-        self.width() / Lanes::<S, T>::COUNT
+        self.width() / Vector::<S, T>::COUNT
     }
 
     /// Adds to y what x gives; `seen` is what the gate sees.
@@ -123,7 +125,7 @@ impl<T: Real> Attenuated<T> {
     ) {
         let AttenuatedTape { open, u, gate, .. } = tape;
         for part in self.parts(rows, open) {
-            let s_bar = grown(&mut scratch.s, rows * part.blocks.len() * self.width());
+            let s_bar = resize(&mut scratch.s, rows * part.blocks.len() * self.width());
             let u = &u[self.place(&part)];
             Arch::new().dispatch(Backward { layer: self, part: &part, x, u, y_bar, x_bar, s_bar });
             self.gate.backward(&part, s_bar, &mut scratch.sums, gate);
@@ -161,7 +163,7 @@ impl<T: Real> Attenuated<T> {
         let AttenuatedTape { open, u, s_dot, gate } = tape;
         for part in self.parts(rows, open) {
             let size = rows * part.blocks.len() * self.width();
-            let (s_hat, s_bar) = grown(&mut scratch.s, 2 * size).split_at_mut(size);
+            let (s_hat, s_bar) = resize(&mut scratch.s, 2 * size).split_at_mut(size);
             let place = self.place(&part);
             let (u, s_dot, in_a) = (&u[place.clone()], &s_dot[place], &mut *gradient.a);
             let (layer, part, x_hat) = (self, &part, &mut *x_hat);
@@ -193,10 +195,10 @@ impl<T: Real> Attenuated<T> {
     }
 }
 
-impl<T: Real> AttenuatedGradient<T> {
+impl<T: Element> AttenuatedGradient<T> {
     /// Adds another.
     pub fn add(&mut self, other: &Self) {
-        super::linear::add(&mut self.a, &other.a);
+        vector::add(&mut self.a, &other.a);
         self.gate.add(&other.gate);
     }
 }

@@ -1,15 +1,16 @@
 //! A convolution of the encoder, with the rectified linear unit behind it.
 
-use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient};
-use super::real::Real;
 use super::rectified::rectify;
-use super::winograd::{self, Winograd};
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::Element;
+use super::winograd::Winograd;
+use crate::engine::winograd;
 use crate::encoder::Precision;
 
 /// Over images whose channels lie together, `[S, S, C]` to `[S', S', O]`.
 #[derive(Debug)]
-pub struct Convolution<T: Real> {
+pub struct Convolution<T: Element> {
     way: Way<T>,
     /// S² C.
     pub inputs: usize,
@@ -18,7 +19,7 @@ pub struct Convolution<T: Real> {
 }
 
 #[derive(Debug)]
-enum Way<T: Real> {
+enum Way<T: Element> {
     Tiles(Winograd<T>),
     HalfTiles(Winograd<T::Half>),
     Patches(Patches<T>),
@@ -39,21 +40,21 @@ struct Patches<T> {
 
 /// Room for what lies between images and outputs, kept from layer to layer.
 #[derive(Debug)]
-pub struct Room<T: Real> {
+pub struct Room<T: Element> {
     tiles: winograd::Room<T>,
     half_tiles: winograd::Room<T::Half>,
     /// `[S' S', K K C]`.
-    patches: Aligned<T>,
+    patches: AlignedVec<T>,
 }
 
-impl<T: Real> Room<T> {
+impl<T: Element> Room<T> {
     /// Empty.
     pub fn new() -> Self {
         Self { tiles: winograd::Room::new(), half_tiles: winograd::Room::new(), patches: zeros(0) }
     }
 }
 
-impl<T: Real> Convolution<T> {
+impl<T: Element> Convolution<T> {
     /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`; patches are always whole.
     pub fn new(
         (side, channels): (usize, usize),
@@ -127,7 +128,7 @@ impl<T: Real> Convolution<T> {
     }
 }
 
-impl<T: Real> Patches<T> {
+impl<T: Element> Patches<T> {
     fn new((side, channels): (usize, usize), (kernel, stride): (usize, usize), weight: &[T], bias: &[T]) -> Self {
         let size = (side - kernel) / stride + 1;
         let starts = (0..size).flat_map(|top| (0..size).map(move |left| (top * side + left) * stride * channels));
@@ -141,9 +142,9 @@ impl<T: Real> Patches<T> {
     }
 
     /// What the kernel sees of an image `[S, S, C]`.
-    fn copied<'a>(&self, x: &[T], patches: &'a mut Aligned<T>) -> &'a mut [T] {
+    fn copied<'a>(&self, x: &[T], patches: &'a mut AlignedVec<T>) -> &'a mut [T] {
         let Self { starts, places, .. } = self;
-        let patches = grown(patches, starts.len() * places.len());
+        let patches = resize(patches, starts.len() * places.len());
         for (patch, start) in patches.chunks_exact_mut(places.len()).zip(starts) {
             patch.iter_mut().zip(places).for_each(|(number, place)| *number = x[start + place]);
         }
@@ -155,7 +156,7 @@ impl<T: Real> Patches<T> {
         (x, y_hat): (&[T], &[T]),
         x_hat: Option<&mut [T]>,
         gradient: &mut LinearGradient<T>,
-        patches: &mut Aligned<T>,
+        patches: &mut AlignedVec<T>,
     ) {
         let Self { starts, places, linear, .. } = self;
         let patches = self.copied(x, patches);
@@ -170,7 +171,7 @@ impl<T: Real> Patches<T> {
 }
 
 /// Rows `[C, P]`, one after the other, as rows `[P, C]`.
-pub fn turn<T: Real>(rows: &[T], channels: usize, positions: usize) -> Vec<T> {
+pub fn turn<T: Element>(rows: &[T], channels: usize, positions: usize) -> Vec<T> {
     let mut turned = Vec::with_capacity(rows.len());
     for row in rows.chunks_exact(channels * positions) {
         for p in 0..positions {

@@ -2,9 +2,9 @@
 
 use super::attenuated::Scratch;
 use super::gated::{Gated, GatedGradient, GatedTape};
-use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
-use super::real::Real;
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::Element;
 
 /// Tapes and gradients are made by the layer that they are used with.
 const MISMATCH: &str = "a layer is plain or gated, and so are its tape and its gradient";
@@ -29,13 +29,13 @@ pub struct Tape<T> {
     inputs: usize,
     outputs: usize,
     /// x and ẋ, `[2 R, inputs]`.
-    x: Aligned<T>,
+    x: AlignedVec<T>,
     /// ŷ and ȳ, `[2 R, outputs]`.
-    y: Aligned<T>,
+    y: AlignedVec<T>,
     gates: Option<GatedTape<T>>,
 }
 
-impl<T: Real> Tape<T> {
+impl<T: Element> Tape<T> {
     /// x `[R, inputs]`, to be written before [`Dense::forward`].
     pub fn x(&mut self, rows: usize) -> &mut [T] {
         &mut self.x[..rows * self.inputs]
@@ -57,7 +57,7 @@ impl<T: Real> Tape<T> {
     }
 }
 
-impl<T: Real> DenseGradient<T> {
+impl<T: Element> DenseGradient<T> {
     /// Adds another of the same layer.
     pub fn add(&mut self, other: &Self) {
         match (self, other) {
@@ -75,7 +75,7 @@ pub enum Order {
     Second,
 }
 
-impl<T: Real> Dense<T> {
+impl<T: Element> Dense<T> {
     /// The layer of this name in a checkpoint. Of its inputs the first are what a rectified linear unit `rectified`, none if that
     /// is 0.
     pub fn named(name: &str, rectified: usize, weights: &impl Weights<T>, gated: bool) -> Self {

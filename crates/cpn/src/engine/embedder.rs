@@ -2,7 +2,7 @@
 
 use super::encoder::{Encoder, EncoderGradient, INPUTS, Tape};
 use super::linear::Weights;
-use super::real::Real;
+use crate::engine::simd::element::Element;
 use crate::config::EncoderConfig;
 use crate::encoder::Precision;
 use crate::method::Observed;
@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 /// Embeds frames and leads gradients back, on some threads, whose tapes are kept from batch to batch.
 #[derive(Debug)]
-pub struct Embedder<T: Real> {
+pub struct Embedder<T: Element> {
     config: EncoderConfig,
     precision: Precision,
     /// By the weights of the last forward pass.
@@ -20,7 +20,7 @@ pub struct Embedder<T: Real> {
 
 /// Frames that are embedded, until it is known what a loss changes by with their embeddings.
 #[derive(Debug)]
-pub struct Embedded<'a, T: Real> {
+pub struct Embedded<'a, T: Element> {
     encoder: &'a Encoder<T>,
     frames: Vec<Observed<'a>>,
     /// Frames of a thread.
@@ -28,7 +28,7 @@ pub struct Embedded<'a, T: Real> {
     tapes: &'a mut [Tape<T>],
 }
 
-impl<T: Real> Embedder<T> {
+impl<T: Element> Embedder<T> {
     /// For encoders of a valid configuration, on `threads` threads, at least one.
     pub fn new(config: EncoderConfig, precision: Precision, threads: usize) -> Self {
         Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| Tape::new()).collect() }
@@ -48,7 +48,7 @@ impl<T: Real> Embedder<T> {
     }
 }
 
-impl<T: Real> Embedded<'_, T> {
+impl<T: Element> Embedded<'_, T> {
     /// From a loss' gradient in the embeddings, `[F, Z]`, to that in each weight by its name in a checkpoint. The order of its
     /// sums depends on nothing but the frames and the number of threads.
     pub fn adjoint(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {

@@ -1,13 +1,15 @@
 //! The encoder f_φ.
 
-use super::convolution::{self, Convolution, turn};
-use super::lanes::{Aligned, grown, zeros};
+use crate::engine::convolution;
+use super::convolution::{Convolution, turn};
 use super::linear::{Linear, LinearGradient, Weights};
 use super::norm::Norm;
-use super::readout::{self, Readout};
-use super::real::Real;
+use super::readout::Readout;
 use super::rectified::{mask, rectify};
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::Element;
 use super::tiles::BEYOND;
+use crate::engine::readout;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::encoder::Precision;
 use crate::images::{BYTES, CHANNELS, SIZE};
@@ -21,7 +23,7 @@ pub const INPUTS: usize = 8;
 
 /// Layers that suit the input, then a linear layer to the embedding.
 #[derive(Debug)]
-pub struct Encoder<T: Real> {
+pub struct Encoder<T: Element> {
     numbers: Numbers<T>,
     layers: Vec<Layer<T>>,
     /// Of the features, which have their channels first in the checkpoint and last here: the weights are turned rather than they.
@@ -39,7 +41,7 @@ enum Numbers<T> {
 
 /// A layer, and the rectified linear unit behind it.
 #[derive(Debug)]
-enum Layer<T: Real> {
+enum Layer<T: Element> {
     Convolution(Convolution<T>),
     Linear(Linear<T>),
 }
@@ -54,25 +56,25 @@ pub struct EncoderGradient<T> {
 
 /// What the forward pass over inputs leaves.
 #[derive(Debug)]
-pub struct Tape<T: Real> {
+pub struct Tape<T: Element> {
     /// For every [`INPUTS`] of them what each layer takes but the first, with [`BEYOND`] numbers behind it.
-    groups: Vec<Vec<Aligned<T>>>,
+    groups: Vec<Vec<AlignedVec<T>>>,
     /// What the first layer takes: soon made again, and four times as large as the bytes that it is made of.
-    first: Aligned<T>,
+    first: AlignedVec<T>,
     /// `[R, F]`.
-    features: Aligned<T>,
+    features: AlignedVec<T>,
     /// What is normalised, `[R, Z]`.
     x: Vec<T>,
     /// Room for the passes.
     convolution: convolution::Room<T>,
     linear: readout::Room<T>,
-    features_hat: Aligned<T>,
+    features_hat: AlignedVec<T>,
     /// x̂ of a layer, and of the one behind it.
-    x_hat: Aligned<T>,
-    y_hat: Aligned<T>,
+    x_hat: AlignedVec<T>,
+    y_hat: AlignedVec<T>,
 }
 
-impl<T: Real> Tape<T> {
+impl<T: Element> Tape<T> {
     /// Empty.
     pub fn new() -> Self {
         Self {
@@ -89,7 +91,7 @@ impl<T: Real> Tape<T> {
     }
 }
 
-impl<T: Real> Encoder<T> {
+impl<T: Element> Encoder<T> {
     /// Reads the weights of a valid configuration. Images are multiplied in this precision, positions as they are: there is
     /// little to multiply, and a place needs more than 8 bits.
     pub fn new(config: &EncoderConfig, precision: Precision, weights: &impl Weights<T>) -> Self {
@@ -115,7 +117,7 @@ impl<T: Real> Encoder<T> {
         if tape.groups.len() < count {
             tape.groups.resize_with(count, || vec![zeros(0); self.layers.len().saturating_sub(1)]);
         }
-        let features = grown(&mut tape.features, inputs.len() * self.linear.inputs);
+        let features = resize(&mut tape.features, inputs.len() * self.linear.inputs);
         let groups = inputs.chunks(INPUTS).zip(features.chunks_mut(INPUTS * self.linear.inputs));
         for (i, (inputs, features)) in groups.enumerate() {
             self.features(inputs, features, (&mut tape.first, &mut tape.groups[i % count]), &mut tape.convolution);
@@ -142,7 +144,7 @@ impl<T: Real> Encoder<T> {
         }
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
-        let features_hat = grown(&mut tape.features_hat, features.len());
+        let features_hat = resize(&mut tape.features_hat, features.len());
         self.linear.adjoint((features, &hat), features_hat, &mut gradient.linear, &mut tape.linear);
         let (Some((first, layers)), Some((in_first, in_layers))) =
             (self.layers.split_first(), gradient.layers.split_first_mut())
@@ -152,11 +154,11 @@ impl<T: Real> Encoder<T> {
         let groups = inputs.chunks(INPUTS).zip(&tape.groups);
         for ((inputs, xs), (mut y, y_hat)) in groups.zip(features.chunks(group).zip(features_hat.chunks(group))) {
             let rows = inputs.len();
-            grown(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
+            resize(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
             for ((layer, x), gradient) in layers.iter().zip(xs).zip(&mut *in_layers).rev() {
                 let y_hat = &mut tape.y_hat[..y.len()];
                 mask(y_hat, y);
-                let x_hat = grown(&mut tape.x_hat, rows * layer.inputs());
+                let x_hat = resize(&mut tape.x_hat, rows * layer.inputs());
                 layer.adjoint((rows, x, y_hat), Some(x_hat), gradient, &mut tape.convolution);
                 swap(&mut tape.x_hat, &mut tape.y_hat);
                 y = &x[..rows * layer.inputs()];
@@ -203,14 +205,14 @@ impl<T: Real> Encoder<T> {
         &self,
         inputs: &[Observed<'_>],
         features: &mut [T],
-        (first, between): (&mut Aligned<T>, &mut [Aligned<T>]),
+        (first, between): (&mut AlignedVec<T>, &mut [AlignedVec<T>]),
         room: &mut convolution::Room<T>,
     ) {
         let Some((last, layers)) = self.layers.split_last() else { return self.numbers.write(inputs, features) };
         let mut x = self.entering(inputs, first);
         for (layer, y) in layers.iter().zip(between) {
             let size = inputs.len() * layer.outputs();
-            let y = grown(y, size + BEYOND);
+            let y = resize(y, size + BEYOND);
             layer.forward(inputs.len(), x, &mut y[..size], room);
             x = y;
         }
@@ -218,14 +220,14 @@ impl<T: Real> Encoder<T> {
     }
 
     /// What the first layer takes, with [`BEYOND`] numbers behind it.
-    fn entering<'a>(&self, inputs: &[Observed<'_>], x: &'a mut Aligned<T>) -> &'a [T] {
-        let x = grown(x, inputs.len() * self.layers[0].inputs() + BEYOND);
+    fn entering<'a>(&self, inputs: &[Observed<'_>], x: &'a mut AlignedVec<T>) -> &'a [T] {
+        let x = resize(x, inputs.len() * self.layers[0].inputs() + BEYOND);
         self.numbers.write(inputs, x);
         x
     }
 }
 
-impl<T: Real> EncoderGradient<T> {
+impl<T: Element> EncoderGradient<T> {
     /// Adds that of other inputs.
     pub fn add(&mut self, other: &Self) {
         let ours = self.layers.iter_mut().flatten().chain([&mut self.linear]).chain(&mut self.norm);
@@ -235,7 +237,7 @@ impl<T: Real> EncoderGradient<T> {
 }
 
 /// The convolutions, with the channels of the last one.
-fn of_images<T: Real>(
+fn of_images<T: Element>(
     config: &ImageEncoderConfig,
     precision: Precision,
     weights: &impl Weights<T>,
@@ -257,7 +259,7 @@ fn of_images<T: Real>(
 }
 
 /// The layers before the last; their features have no positions.
-fn of_positions<T: Real>(
+fn of_positions<T: Element>(
     config: &PositionEncoderConfig,
     weights: &impl Weights<T>,
 ) -> (Numbers<T>, Vec<Layer<T>>, usize) {
@@ -269,7 +271,7 @@ fn of_positions<T: Real>(
     (numbers, (0..config.layers.len()).map(layer).collect(), 1)
 }
 
-impl<T: Real> Layer<T> {
+impl<T: Element> Layer<T> {
     fn inputs(&self) -> usize {
         match self {
             Self::Convolution(convolution) => convolution.inputs,
@@ -322,7 +324,7 @@ impl<T: Real> Layer<T> {
     }
 }
 
-impl<T: Real> Numbers<T> {
+impl<T: Element> Numbers<T> {
     fn write(&self, inputs: &[Observed<'_>], x: &mut [T]) {
         match self {
             Self::Pixels => {
@@ -349,7 +351,7 @@ struct Scale<'a, T> {
     x: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Scale<'_, T> {
+impl<T: Element> WithSimd for Scale<'_, T> {
     type Output = ();
 
     // Nothing here names a register; the compiler finds them, as wide as the dispatch says there are.

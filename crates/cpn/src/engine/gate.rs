@@ -1,10 +1,10 @@
 //! u_β or v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to [what is
 //! attenuated](super::attenuated), which runs over the same numbers anyway, and asks for them part by part.
 
-use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient, Weights};
-use super::real::Real;
 use super::rectified::{Open, rectify};
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::Element;
 use super::sparse::{Part, Sparse, SparseGradient, Taker};
 
 /// Weights of a part: 32 KB in float32.
@@ -31,14 +31,14 @@ pub struct GateTape<T> {
     /// K.
     hidden: usize,
     /// h and ḣ, `[2 R, K]`.
-    h: Aligned<T>,
+    h: AlignedVec<T>,
     /// Where h is not zero.
     open: Open,
     /// ĥ and h̄, `[2 R, K]`.
-    h_adjoint: Aligned<T>,
+    h_adjoint: AlignedVec<T>,
 }
 
-impl<T: Real> Gate<T> {
+impl<T: Element> Gate<T> {
     /// The gate of this name in a checkpoint, of blocks of O = `outputs`.
     pub fn named(name: &str, weights: &impl Weights<T>, outputs: usize) -> Self {
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("{name}.output.{part}")));
@@ -97,7 +97,7 @@ impl<T: Real> Gate<T> {
     }
 
     /// Adds up h̄ from s̄ of a part, the first of which begins anew.
-    pub fn backward(&self, part: &Part<'_>, s_bar: &[T], sums: &mut Aligned<T>, tape: &mut GateTape<T>) {
+    pub fn backward(&self, part: &Part<'_>, s_bar: &[T], sums: &mut AlignedVec<T>, tape: &mut GateTape<T>) {
         let size = part.rows * tape.hidden;
         self.output.backward(part, &tape.open, s_bar, sums, &mut tape.h_adjoint[size..2 * size]);
     }
@@ -113,7 +113,7 @@ impl<T: Real> Gate<T> {
         &self,
         part: &Part<'_>,
         (s_hat, s_bar): (&[T], Option<&[T]>),
-        sums: &mut Aligned<T>,
+        sums: &mut AlignedVec<T>,
         tape: &mut GateTape<T>,
         gradient: &mut GateGradient<T>,
     ) {
@@ -141,7 +141,7 @@ impl<T: Real> Gate<T> {
     }
 }
 
-impl<T: Real> GateGradient<T> {
+impl<T: Element> GateGradient<T> {
     /// Adds another.
     pub fn add(&mut self, other: &Self) {
         self.hidden.add(&other.hidden);

@@ -12,7 +12,7 @@
 
 use super::attenuated::{Attenuated, AttenuatedGradient, AttenuatedTape, Scratch};
 use super::linear::Weights;
-use super::real::Real;
+use crate::engine::simd::element::Element;
 
 /// The layer's weights and biases.
 #[derive(Debug)]
@@ -41,7 +41,7 @@ pub struct GatedTape<T> {
     nothing: Vec<T>,
 }
 
-impl<T: Real> Gated<T> {
+impl<T: Element> Gated<T> {
     /// The layer of this name in a checkpoint; a rectified linear unit left the first of its inputs.
     pub fn named(name: &str, rectified: usize, weights: &impl Weights<T>) -> Self {
         let [a, b] = ["weight", "bias"].map(|part| weights.get(&format!("{name}.{part}")));
@@ -131,7 +131,7 @@ impl<T: Real> Gated<T> {
     }
 }
 
-impl<T: Real> GatedGradient<T> {
+impl<T: Element> GatedGradient<T> {
     /// Adds another.
     pub fn add(&mut self, other: &Self) {
         self.a.add(&other.a);

@@ -1,7 +1,7 @@
 //! The inner loop: a rollout of g_θ, how far from the goal it ends, and the gradient of that in its actions.
 
 use super::network::{Buffers, Network, Step};
-use super::real::Real;
+use crate::engine::simd::element::Element;
 
 /// A rollout over a block of R samples.
 #[derive(Debug)]
@@ -36,7 +36,7 @@ pub enum Purpose {
     Gradient,
 }
 
-impl<T: Real> Rollout<T> {
+impl<T: Element> Rollout<T> {
     /// Room for H = `horizon` steps of blocks of up to `rows` samples.
     pub fn new(network: &Network<T>, rows: usize, horizon: usize) -> Self {
         Self {
@@ -99,7 +99,7 @@ impl<T: Real> Rollout<T> {
 }
 
 /// The derivative of the Huber loss with δ = 1.
-pub fn clamp<T: Real>(x: T) -> T {
+pub fn clamp<T: Element>(x: T) -> T {
     if x > T::ONE {
         T::ONE
     } else if x < -T::ONE {

@@ -1,11 +1,10 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
-use super::factor::Factor;
-use super::lanes::{Aligned, Lanes, zeros};
 use super::matrix::{Matrix, Panels};
 use super::product::{Left, multiply};
-use super::real::Real;
-use pulp::{Arch, Simd, WithSimd};
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::{Element, Operand};
+use crate::engine::simd::vector::add;
 
 /// Weights by their names in a checkpoint.
 pub trait Weights<T> {
@@ -19,7 +18,7 @@ pub struct Linear<E, T = E> {
     pub inputs: usize,
     pub outputs: usize,
     /// a, `[outputs, inputs]`, across its rows.
-    weight: Aligned<E>,
+    weight: AlignedVec<E>,
     /// aᵀ, `[inputs, outputs]`, along a's rows: each product reads the one whose rows it runs along.
     transposed: Panels<E>,
     /// b, `[outputs]`.
@@ -30,18 +29,18 @@ pub struct Linear<E, T = E> {
 #[derive(Debug, Clone)]
 pub struct LinearGradient<T> {
     /// `[outputs, inputs]`; of a norm `[Z]`, as the other.
-    pub weight: Aligned<T>,
+    pub weight: AlignedVec<T>,
     /// `[outputs]`.
-    pub bias: Aligned<T>,
+    pub bias: AlignedVec<T>,
 }
 
-impl<T: Real, E: Factor<Sum = T>> Linear<E, T> {
+impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
     /// A layer of a `[outputs, inputs]` and b `[outputs]`.
     pub fn new(weight: &[T], bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
         let mut room = zeros(0);
-        let transposed = Panels::transposed(E::along(weight, &mut room), inputs / E::NUMBERS);
-        let weight = Aligned::from_slice(0, E::across(weight, inputs, &mut room));
+        let transposed = Panels::transposed(E::pack_along_k(weight, &mut room), inputs / E::PACK);
+        let weight = AlignedVec::from_slice(0, E::pack_row_pairs(weight, inputs, &mut room));
         Self { inputs, outputs, weight, transposed, bias }
     }
 
@@ -80,7 +79,7 @@ impl<T: Real, E: Factor<Sum = T>> Linear<E, T> {
     }
 }
 
-impl<T: Real> Linear<T> {
+impl<T: Element> Linear<T> {
     /// The layer of this name in a checkpoint.
     pub fn named(name: &str, weights: &impl Weights<T>) -> Self {
         Self::new(&weights.get(&format!("{name}.weight")), weights.get(&format!("{name}.bias")))
@@ -93,7 +92,7 @@ impl<T: Real> Linear<T> {
     }
 }
 
-impl<T: Real> LinearGradient<T> {
+impl<T: Element> LinearGradient<T> {
     /// Adds ∂Φ/∂b, from the rows of ŷ.
     pub fn add_bias(&mut self, y: &[T]) {
         for row in y.chunks_exact(self.bias.len()) {
@@ -110,28 +109,5 @@ impl<T: Real> LinearGradient<T> {
     /// By the names of the weights.
     pub fn in_weights(&self, name: &str) -> Vec<(String, Vec<T>)> {
         vec![(format!("{name}.weight"), self.weight.to_vec()), (format!("{name}.bias"), self.bias.to_vec())]
-    }
-}
-
-/// `sum += x`, element by element.
-pub fn add<T: Real>(sum: &mut [T], x: &[T]) {
-    Arch::new().dispatch(Sum { sum, x });
-}
-
-#[derive(Debug)]
-struct Sum<'a, T> {
-    sum: &'a mut [T],
-    x: &'a [T],
-}
-
-impl<T: Real> WithSimd for Sum<'_, T> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let count = Lanes::<S, T>::COUNT;
-        for (sum, x) in self.sum.chunks_mut(count).zip(self.x.chunks(count)) {
-            Lanes::load(simd, x).add_to(sum);
-        }
     }
 }

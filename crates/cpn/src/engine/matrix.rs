@@ -1,9 +1,8 @@
 //! Matrices as [products](super::product) read them.
 
-use super::factor::Factor;
-use super::lanes::{Aligned, zeros};
-use pulp::{Simd, WithSimd};
-use std::marker::PhantomData;
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::Operand;
+use crate::engine::simd::vector::VectorShape;
 
 /// Registers side by side in a panel.
 pub const REGISTERS: usize = 2;
@@ -27,10 +26,10 @@ pub struct Matrix<'a, E> {
     pub whole: usize,
 }
 
-impl<'a, E: Factor> Matrix<'a, E> {
+impl<'a, E: Operand> Matrix<'a, E> {
     /// `[inner, columns]`, row by row.
     pub fn new(values: &'a [E], columns: usize) -> Self {
-        let (inner, shape) = (values.len() / columns, Shape::of::<E>());
+        let (inner, shape) = (values.len() / columns, VectorShape::of::<E>());
         let end = |side_by_side| columns.next_multiple_of(side_by_side * shape.lanes);
         let more = shape.registers >= 32 && end(MORE_REGISTERS) < end(REGISTERS);
         let side_by_side = if more { MORE_REGISTERS } else { REGISTERS };
@@ -51,12 +50,12 @@ impl<'a, E: Factor> Matrix<'a, E> {
 /// zeros.
 #[derive(Debug)]
 pub struct Panels<E> {
-    values: Aligned<E>,
+    values: AlignedVec<E>,
     inner: usize,
     columns: usize,
 }
 
-impl<E: Factor> Panels<E> {
+impl<E: Operand> Panels<E> {
     /// Lays out the transpose of `[columns, inner]`.
     pub fn transposed(values: &[E], inner: usize) -> Self {
         let (columns, width) = (values.len() / inner, Self::width());
@@ -75,7 +74,7 @@ impl<E: Factor> Panels<E> {
 
     /// Columns of a panel.
     fn width() -> usize {
-        REGISTERS * Shape::of::<E>().lanes
+        REGISTERS * VectorShape::of::<E>().lanes
     }
 
     /// All of it, for a product.
@@ -83,29 +82,5 @@ impl<E: Factor> Panels<E> {
         let &Self { ref values, inner, columns } = self;
         let (stride, side_by_side) = (Self::width(), REGISTERS);
         Matrix { values, inner, columns, stride, side_by_side, in_panels: true, whole: inner }
-    }
-}
-
-/// What suits this processor.
-#[derive(Debug, Clone, Copy)]
-pub struct Shape {
-    /// Factors, or sums, in a register.
-    pub lanes: usize,
-    /// Registers.
-    pub registers: usize,
-}
-
-impl Shape {
-    pub fn of<E: Factor>() -> Self {
-        struct Ask<E>(PhantomData<E>);
-        impl<E: Factor> WithSimd for Ask<E> {
-            type Output = Shape;
-
-            #[inline(always)]
-            fn with_simd<S: Simd>(self, _simd: S) -> Shape {
-                Shape { lanes: size_of::<E::Lanes<S>>() / size_of::<E>(), registers: S::REGISTER_COUNT }
-            }
-        }
-        E::dispatch(Ask::<E>(PhantomData))
     }
 }

@@ -23,35 +23,33 @@ mod dense;
 mod descent;
 mod embedder;
 mod encoder;
-mod factor;
 mod gate;
 mod gated;
 mod inner;
-mod lanes;
 mod linear;
 mod matrix;
 mod modulation;
 mod network;
 mod norm;
 mod outer;
-mod pair;
 mod planner;
 mod product;
 mod readout;
-mod real;
 mod rectified;
 mod sampling;
+mod simd;
 mod sparse;
 mod tiles;
 mod winograd;
 
 pub(crate) use descent::Descent;
 pub use embedder::Embedder;
-pub use linear::{Weights, add};
+pub use linear::Weights;
 pub use outer::Samples;
 pub use planner::Planner;
-pub use real::Real;
 pub(crate) use sampling::Sampling;
+pub use simd::element::Element;
+pub use simd::vector::add;
 
 use crate::config::ModelConfig;
 use network::Network;
@@ -59,7 +57,6 @@ use outer::{Settings, Sums, Workspace};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use tch::Tensor;
-use tch::kind::Element;
 
 /// R, the samples of a block in training: more, and weights are read less often; fewer, and what the passes leave stays nearer.
 const BLOCK: usize = 32;
@@ -91,7 +88,7 @@ pub struct OuterGradient<T> {
     pub weights: Vec<(String, Vec<T>)>,
 }
 
-impl<T: Real> OuterLoop<T> {
+impl<T: Element> OuterLoop<T> {
     /// For models of a valid configuration, on `threads` threads, at least one.
     pub fn new(config: ModelConfig, threads: usize) -> Self {
         let worker = || Worker { workspace: None, sums: None };
@@ -133,7 +130,7 @@ impl<T: Real> OuterLoop<T> {
 /// An agent's weights.
 pub(crate) struct Variables<'a>(pub &'a HashMap<String, Tensor>);
 
-impl<T: Element + Copy> Weights<T> for Variables<'_> {
+impl<T: tch::kind::Element + Copy> Weights<T> for Variables<'_> {
     fn get(&self, name: &str) -> Vec<T> {
         floats(&self.0[name])
     }
@@ -141,10 +138,10 @@ impl<T: Element + Copy> Weights<T> for Variables<'_> {
 
 /// Whether bfloat16 is multiplied faster than float32 here.
 pub(crate) fn bfloat16_is_fast() -> bool {
-    pair::Pair::is_fast()
+    simd::bf16::Bf16x2::is_fast()
 }
 
 /// A tensor's numbers, row by row.
-pub(crate) fn floats<T: Element + Copy>(tensor: &Tensor) -> Vec<T> {
+pub(crate) fn floats<T: tch::kind::Element + Copy>(tensor: &Tensor) -> Vec<T> {
     Vec::try_from(tensor.flatten(0, -1)).expect("a tensor of the kind that was asked for")
 }

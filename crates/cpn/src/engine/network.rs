@@ -2,10 +2,11 @@
 
 use super::attenuated::Scratch;
 use super::dense::{Dense, DenseGradient, Order, Tape};
-use super::lanes::{Aligned, zeros};
-use super::linear::{Weights, add};
-use super::real::Real;
+use super::linear::Weights;
+use crate::engine::simd::vector::add;
 use super::rectified::{mask, rectify};
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::Element;
 use crate::config::ModelConfig;
 
 /// The layers of both branches.
@@ -49,9 +50,9 @@ pub struct Step<T> {
     policy: [Tape<T>; 2],
     dynamics: Option<[Tape<T>; 2]>,
     /// The trunk's features `[R, hidden]`.
-    features: Aligned<T>,
+    features: AlignedVec<T>,
     /// What the policy proposed, `[R, A]`.
-    proposed: Aligned<T>,
+    proposed: AlignedVec<T>,
 }
 
 /// Room that no pass needs beyond its end.
@@ -59,11 +60,11 @@ pub struct Step<T> {
 pub struct Buffers<T> {
     gates: Scratch<T>,
     /// Features with the action, or what the trunk sees.
-    wide: Aligned<T>,
-    narrow: Aligned<T>,
+    wide: AlignedVec<T>,
+    narrow: AlignedVec<T>,
 }
 
-impl<T: Real> Network<T> {
+impl<T: Element> Network<T> {
     /// Reads the weights of a model of this configuration.
     pub fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
         let method = config.method;
@@ -297,7 +298,7 @@ impl<T: Real> Network<T> {
     }
 }
 
-impl<T: Real> NetworkGradient<T> {
+impl<T: Element> NetworkGradient<T> {
     /// Adds another.
     pub fn add(&mut self, other: &Self) {
         let ours = [&mut self.trunk].into_iter().chain(&mut self.policy).chain(self.dynamics.iter_mut().flatten());

@@ -1,8 +1,8 @@
 //! Layer normalisation.
 
-use super::lanes::zeros;
 use super::linear::{LinearGradient, Weights};
-use super::real::Real;
+use crate::engine::simd::buffer::zeros;
+use crate::engine::simd::element::Element;
 
 /// What is added to the variance, as libtorch does.
 const EPSILON: f64 = 1e-5;
@@ -14,7 +14,7 @@ pub struct Norm<T> {
     bias: Vec<T>,
 }
 
-impl<T: Real> Norm<T> {
+impl<T: Element> Norm<T> {
     /// The one of this name in a checkpoint.
     pub fn named(name: &str, weights: &impl Weights<T>) -> Self {
         Self { weight: weights.get(&format!("{name}.weight")), bias: weights.get(&format!("{name}.bias")) }
@@ -58,7 +58,7 @@ impl<T: Real> Norm<T> {
 }
 
 /// A row's mean, and 1 by its deviation.
-fn moments<T: Real>(x: &[T]) -> (T, T) {
+fn moments<T: Element>(x: &[T]) -> (T, T) {
     let count = T::count(x.len());
     let mean = x.iter().copied().sum::<T>() / count;
     let variance = x.iter().map(|x| (*x - mean) * (*x - mean)).sum::<T>() / count;

@@ -1,9 +1,10 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
+use crate::engine::simd::vector;
 use super::dense::Order;
 use super::inner::{Actions, Purpose, Rollout, clamp};
 use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
-use super::real::Real;
+use crate::engine::simd::element::Element;
 
 /// What the rows of a batch are about.
 #[derive(Debug, Clone, Copy)]
@@ -58,7 +59,7 @@ pub struct Workspace<T> {
     x_hat: Vec<T>,
 }
 
-impl<'a, T: Real> Samples<'a, T> {
+impl<'a, T: Element> Samples<'a, T> {
     /// How many, with Z.
     pub fn rows(&self, latent: usize) -> usize {
         self.x.len() / latent
@@ -75,7 +76,7 @@ impl<'a, T: Real> Samples<'a, T> {
     }
 }
 
-impl<T: Real> Sums<T> {
+impl<T: Element> Sums<T> {
     /// Sums of nothing.
     pub fn zeros(network: &Network<T>) -> Self {
         Self { loss: T::ZERO, step_size: T::ZERO, network: network.gradient() }
@@ -99,7 +100,7 @@ impl<T: Real> Sums<T> {
     }
 }
 
-impl<T: Real> Workspace<T> {
+impl<T: Element> Workspace<T> {
     /// Room for blocks of up to `rows` samples.
     pub fn new(network: &Network<T>, rows: usize, horizon: usize, updates: usize) -> Self {
         let Sizes { latent, actions, .. } = network.sizes;
@@ -143,7 +144,7 @@ impl<T: Real> Workspace<T> {
                 self.x_hat[..x_hat.len()].fill(T::ZERO);
             }
             self.adjoints(network, settings, rows, k, x_g_hat, &mut sums.network);
-            super::linear::add(x_hat, &self.x_hat[..x_hat.len()]);
+            vector::add(x_hat, &self.x_hat[..x_hat.len()]);
         }
     }
 

@@ -6,8 +6,8 @@ use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
 use super::linear::Weights;
 use super::network::{Buffers, Network};
-use super::real::Real;
 use super::sampling::Sampling;
+use crate::engine::simd::element::Element;
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
@@ -41,7 +41,7 @@ pub(super) struct Dynamics<T> {
 
 /// One thread's memory.
 #[derive(Debug)]
-pub(super) struct Worker<T: Real> {
+pub(super) struct Worker<T: Element> {
     tape: Tape<T>,
     pub(super) rollout: Rollout<T>,
     pub(super) buffers: Buffers<T>,
@@ -67,7 +67,7 @@ impl Planner {
     }
 }
 
-impl<T: Real> Dynamics<T> {
+impl<T: Element> Dynamics<T> {
     fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
         Self {
             network: Network::new(config, weights),
@@ -78,7 +78,7 @@ impl<T: Real> Dynamics<T> {
     }
 }
 
-impl<T: Real> Worker<T> {
+impl<T: Element> Worker<T> {
     fn new(dynamics: &Dynamics<T>) -> Self {
         let sizes = dynamics.network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];

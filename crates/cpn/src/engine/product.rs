@@ -4,10 +4,9 @@
 //! What the kernel keeps in registers is filled in loops of fixed length over slices of fixed length: closures and iterators
 //! in their place send it through memory.
 
-use super::factor::Factor;
-use super::lanes::Lanes;
-use super::matrix::{MORE_REGISTERS, Matrix, REGISTERS, Shape};
-use super::real::Real;
+use super::matrix::{MORE_REGISTERS, Matrix, REGISTERS};
+use crate::engine::simd::element::{Element, Operand};
+use crate::engine::simd::vector::{Vector, VectorShape};
 use pulp::{Simd, WithSimd};
 use std::ops::Range;
 
@@ -19,13 +18,13 @@ const CHUNK: usize = 256;
 const SMALL: usize = 1 << 14;
 
 /// c = a b, added to what is in c if `accumulate`: c is `[rows, columns]`.
-pub fn multiply<E: Factor>(accumulate: bool, c: &mut [E::Sum], a: Left<'_, E>, b: Matrix<'_, E>) {
+pub fn multiply<E: Operand>(accumulate: bool, c: &mut [E::Sum], a: Left<'_, E>, b: Matrix<'_, E>) {
     let mut product = Product { accumulate, rows: c.len() / b.columns, c, a, b };
     product.run();
 }
 
 #[derive(Debug)]
-struct Product<'a, E: Factor> {
+struct Product<'a, E: Operand> {
     accumulate: bool,
     rows: usize,
     c: &'a mut [E::Sum],
@@ -43,12 +42,12 @@ pub enum Left<'a, E> {
 }
 
 /// Sums in registers: of R rows, at P panels of W registers.
-type Sums<S, T, const R: usize, const P: usize, const W: usize> = [[[Lanes<S, T>; W]; P]; R];
+type Sums<S, T, const R: usize, const P: usize, const W: usize> = [[[Vector<S, T>; W]; P]; R];
 
 /// A place along the inner dimension, with b's numbers there from each of P panels on.
 type Place<'a, E, const P: usize> = (usize, [&'a [E]; P]);
 
-impl<E: Factor> Product<'_, E> {
+impl<E: Operand> Product<'_, E> {
     fn run(&mut self) {
         let (rows, Matrix { inner, columns, .. }) = (self.rows, self.b);
         let (Left::Rows(a) | Left::Turned(a)) = self.a;
@@ -64,7 +63,7 @@ impl<E: Factor> Product<'_, E> {
     fn rows<const W: usize>(&mut self) {
         // As many rows at once as there are registers for their sums, a part of b and a number of a.
         let mut row = 0;
-        if Shape::of::<E>().registers >= 32 {
+        if VectorShape::of::<E>().registers >= 32 {
             row = self.tiles::<8, W>(row);
         }
         row = self.tiles::<6, W>(row);
@@ -96,7 +95,7 @@ impl<E: Factor> Product<'_, E> {
         places: [impl Iterator<Item = Place<'a, E, P>>; 2],
         room: &mut [E::Sum],
     ) {
-        let (columns, count) = (self.b.columns, Lanes::<S, E::Sum>::COUNT);
+        let (columns, count) = (self.b.columns, Vector::<S, E::Sum>::COUNT);
         let (at, width) = (panel * W * count, P * W * count);
         let is_out = columns - at < width;
         let lines = (row..row + R).map(|row| row * columns + at..(row + 1) * columns);
@@ -106,13 +105,13 @@ impl<E: Factor> Product<'_, E> {
             }
         }
         let (c, stride) = if is_out { (&mut room[..], width) } else { (&mut self.c[row * columns + at..], columns) };
-        let mut sums = [[[Lanes::splat(simd, E::Sum::ZERO); W]; P]; R];
+        let mut sums = [[[Vector::splat(simd, E::Sum::ZERO); W]; P]; R];
         if !first {
             for (r, sums) in sums.iter_mut().enumerate() {
                 let line = &c[r * stride..][..width];
                 for (p, sums) in sums.iter_mut().enumerate() {
                     for (i, sum) in sums.iter_mut().enumerate() {
-                        *sum = Lanes::load(simd, &line[(p * W + i) * count..][..count]);
+                        *sum = Vector::load(simd, &line[(p * W + i) * count..][..count]);
                     }
                 }
             }
@@ -135,19 +134,19 @@ impl<E: Factor> Product<'_, E> {
 
 /// R rows at a time.
 #[derive(Debug)]
-struct Tiles<'a, 'b, E: Factor, const R: usize, const W: usize> {
+struct Tiles<'a, 'b, E: Operand, const R: usize, const W: usize> {
     product: &'a mut Product<'b, E>,
     rows: Range<usize>,
 }
 
-impl<E: Factor, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, E, R, W> {
+impl<E: Operand, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, E, R, W> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { product, rows } = self;
         let b = product.b;
-        let width = W * Lanes::<S, E::Sum>::COUNT;
+        let width = W * Vector::<S, E::Sum>::COUNT;
         let mut room = beyond(b.columns, width);
         let room = room.as_mut_slice().as_flattened_mut();
         for panel in 0..b.columns.div_ceil(width) {
@@ -165,18 +164,18 @@ impl<E: Factor, const R: usize, const W: usize> WithSimd for Tiles<'_, '_, E, R,
 
 /// A row by itself, which waits for b to be read; half of it need not be where a is what a rectified linear unit left.
 #[derive(Debug)]
-struct Row<'a, 'b, E: Factor> {
+struct Row<'a, 'b, E: Operand> {
     product: &'a mut Product<'b, E>,
     row: usize,
 }
 
-impl<E: Factor> WithSimd for Row<'_, '_, E> {
+impl<E: Operand> WithSimd for Row<'_, '_, E> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let Product { a, b: Matrix { inner, whole, columns, .. }, accumulate, .. } = *self.product;
-        let mut room = beyond(columns, REGISTERS * Lanes::<S, E::Sum>::COUNT);
+        let mut room = beyond(columns, REGISTERS * Vector::<S, E::Sum>::COUNT);
         let room = room.as_mut_slice().as_flattened_mut();
         let (Left::Rows(a), SMALL..) = (a, inner * columns) else {
             return self.panels(simd, !accumulate, [0..whole, whole..inner], room);
@@ -196,7 +195,7 @@ impl<E: Factor> WithSimd for Row<'_, '_, E> {
     }
 }
 
-impl<E: Factor> Row<'_, '_, E> {
+impl<E: Operand> Row<'_, '_, E> {
     /// Several panels at once, so that no sum waits for the one before.
     #[inline(always)]
     fn panels<S: Simd>(
@@ -206,7 +205,7 @@ impl<E: Factor> Row<'_, '_, E> {
         places: [impl Iterator<Item = usize> + Clone; 2],
         room: &mut [E::Sum],
     ) {
-        let panels = self.product.b.columns.div_ceil(REGISTERS * Lanes::<S, E::Sum>::COUNT);
+        let panels = self.product.b.columns.div_ceil(REGISTERS * Vector::<S, E::Sum>::COUNT);
         let mut panel = 0;
         while panel + 4 <= panels {
             self.several::<S, 4>(simd, panel, first, places.clone(), room);
@@ -234,7 +233,7 @@ impl<E: Factor> Row<'_, '_, E> {
         let b = self.product.b;
         let mut panels = [b.values; P];
         for (p, values) in panels.iter_mut().enumerate() {
-            *values = b.panel(panel + p, REGISTERS * Lanes::<S, E::Sum>::COUNT);
+            *values = b.panel(panel + p, REGISTERS * Vector::<S, E::Sum>::COUNT);
         }
         let lines = |k: usize| {
             let mut lines = panels;
@@ -255,13 +254,13 @@ impl<E: Factor> Row<'_, '_, E> {
 
 /// Room for a tile that juts out over the right edge, if one can: to fill it with zeros takes its time.
 #[inline(always)]
-fn beyond<T: Real>(columns: usize, width: usize) -> Option<[T; TILE]> {
+fn beyond<T: Element>(columns: usize, width: usize) -> Option<[T; TILE]> {
     if columns.is_multiple_of(width) { None } else { Some([T::ZERO; TILE]) }
 }
 
 /// Adds to sums what some places along the inner dimension give.
 #[inline(always)]
-fn along<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize>(
+fn along<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: usize>(
     simd: S,
     mut sums: Sums<S, E::Sum, R, P, W>,
     (a, row, count): (Left<'_, E>, usize, usize),
@@ -289,13 +288,13 @@ fn along<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize>
 /// Adds to the sums, for each place, R numbers of a, which `a` answers, times P panels of b, whose rows may end within a
 /// register if they are not WHOLE.
 #[inline(always)]
-fn add<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize, const WHOLE: bool>(
+fn add<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: usize, const WHOLE: bool>(
     simd: S,
     mut sums: Sums<S, E::Sum, R, P, W>,
     places: impl Iterator<Item = Place<'a, E, P>>,
     a: impl Fn(usize, usize) -> E,
 ) -> Sums<S, E::Sum, R, P, W> {
-    let count = Lanes::<S, E::Sum>::COUNT;
+    let count = Vector::<S, E::Sum>::COUNT;
     for (k, lines) in places {
         for (p, mut line) in lines.into_iter().enumerate() {
             if WHOLE {
@@ -315,4 +314,60 @@ fn add<'a, S: Simd, E: Factor, const R: usize, const P: usize, const W: usize, c
         }
     }
     sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::matrix::Panels;
+    use super::*;
+    use crate::engine::simd::bf16::Bf16x2;
+    use crate::engine::simd::buffer::zeros;
+
+    /// Numbers from -1 to 1, none of which fits bfloat16.
+    fn numbers(count: usize, seed: usize) -> Vec<f32> {
+        (0..count).map(|i| ((i * 7919 + seed * 104_729) % 9973) as f32 / 4986.5 - 1.0001).collect()
+    }
+
+    fn nearest(number: f32) -> f64 {
+        f32::from_bits((number.to_bits() + 0x8000) & 0xffff_0000).into()
+    }
+
+    /// a `[rows, inner]` times b `[inner, columns]`, both rounded.
+    fn expected(a: &[f32], b: &[f32], columns: usize) -> Vec<f64> {
+        let inner = b.len() / columns;
+        let columns = turned(b, columns);
+        let sum = |row: &[f32], column: &[f32]| row.iter().zip(column).map(|(a, b)| nearest(*a) * nearest(*b)).sum();
+        a.chunks_exact(inner)
+            .flat_map(|row| columns.chunks_exact(inner).map(|column| sum(row, column)).collect::<Vec<_>>())
+            .collect()
+    }
+
+    fn turned(values: &[f32], columns: usize) -> Vec<f32> {
+        (0..columns).flat_map(|c| values.iter().skip(c).step_by(columns).copied()).collect()
+    }
+
+    fn assert_close(ours: &[f32], expected: &[f64], what: &str) {
+        for (ours, expected) in ours.iter().zip(expected) {
+            assert!((f64::from(*ours) - expected).abs() < 1e-4, "{what}: {ours} for {expected}");
+        }
+    }
+
+    #[test]
+    fn products_are_those_of_rounded_numbers() {
+        for (rows, inner, columns) in [(1, 2, 1), (3, 48, 32), (17, 130, 33), (64, 256, 64), (1, 512, 70)] {
+            let (a, b) = (numbers(rows * inner, 1), numbers(inner * columns, 2));
+            let expected = expected(&a, &b, columns);
+            let (a_turned, b_turned) = (turned(&a, inner), turned(&b, columns));
+            let mut rooms = [(); 4].map(|()| zeros(0));
+            let [along, panels, across, down] = &mut rooms;
+            let (along, across) = (Bf16x2::pack_along_k(&a, along), Bf16x2::pack_row_pairs(&b, columns, across));
+            let panels = Panels::transposed(Bf16x2::pack_along_k(&b_turned, panels), inner / 2);
+            let lefts = [Left::Rows(along), Left::Turned(Bf16x2::pack_row_pairs(&a_turned, rows, down))];
+            for (left, b) in lefts.into_iter().flat_map(|a| [(a, panels.matrix()), (a, Matrix::new(across, columns))]) {
+                let mut c = vec![f32::NAN; rows * columns];
+                multiply(false, &mut c, left, b);
+                assert_close(&c, &expected, &format!("{rows} x {inner} x {columns}"));
+            }
+        }
+    }
 }

@@ -1,14 +1,13 @@
 //! The encoder's last layer, from features to what is normalised.
 
-use super::factor::Factor;
-use super::lanes::{Aligned, zeros};
 use super::linear::{Linear, LinearGradient};
-use super::real::Real;
+use crate::engine::simd::buffer::{AlignedVec, zeros};
+use crate::engine::simd::element::{Element, Operand};
 use crate::encoder::Precision;
 
 /// A linear layer that multiplies numbers as they are, or more coarsely.
 #[derive(Debug)]
-pub struct Readout<T: Real> {
+pub struct Readout<T: Element> {
     layer: Layer<T>,
     /// F.
     pub inputs: usize,
@@ -17,30 +16,30 @@ pub struct Readout<T: Real> {
 }
 
 #[derive(Debug)]
-enum Layer<T: Real> {
+enum Layer<T: Element> {
     Whole(Linear<T>),
     Half(Linear<T::Half, T>),
 }
 
 /// Room for both sides as factors, if they are not multiplied as they are.
 #[derive(Debug)]
-pub struct Room<T: Real> {
-    whole: [Aligned<T>; 2],
-    half: [Aligned<T::Half>; 2],
+pub struct Room<T: Element> {
+    whole: [AlignedVec<T>; 2],
+    half: [AlignedVec<T::Half>; 2],
 }
 
-impl<T: Real> Room<T> {
+impl<T: Element> Room<T> {
     /// Empty.
     pub fn new() -> Self {
         Self { whole: [zeros(0), zeros(0)], half: [zeros(0), zeros(0)] }
     }
 }
 
-impl<T: Real> Readout<T> {
+impl<T: Element> Readout<T> {
     /// Of weight `[Z, F]` and bias `[Z]`; odd sizes are always whole.
     pub fn new(weight: &[T], bias: Vec<T>, precision: Precision) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
-        let are_factors = [inputs, outputs].iter().all(|size| size.is_multiple_of(T::Half::NUMBERS));
+        let are_factors = [inputs, outputs].iter().all(|size| size.is_multiple_of(T::Half::PACK));
         let layer = if precision == Precision::Bfloat16 && are_factors {
             Layer::Half(Linear::new(weight, bias))
         } else {
@@ -77,19 +76,19 @@ impl<T: Real> Readout<T> {
     }
 }
 
-fn forward<T: Real, E: Factor<Sum = T>>(linear: &Linear<E, T>, x: &[T], y: &mut [T], [in_x, _]: &mut [Aligned<E>; 2]) {
-    linear.forward(E::along(x, in_x), y);
+fn forward<T: Element, E: Operand<Sum = T>>(linear: &Linear<E, T>, x: &[T], y: &mut [T], [in_x, _]: &mut [AlignedVec<E>; 2]) {
+    linear.forward(E::pack_along_k(x, in_x), y);
 }
 
-fn adjoint<T: Real, E: Factor<Sum = T>>(
+fn adjoint<T: Element, E: Operand<Sum = T>>(
     linear: &Linear<E, T>,
     (x, y_hat): (&[T], &[T]),
     x_hat: &mut [T],
     gradient: &mut LinearGradient<T>,
-    [in_x, in_y]: &mut [Aligned<E>; 2],
+    [in_x, in_y]: &mut [AlignedVec<E>; 2],
 ) {
-    let factors = (E::across(x, linear.inputs, in_x), E::across(y_hat, linear.outputs, in_y));
+    let factors = (E::pack_row_pairs(x, linear.inputs, in_x), E::pack_row_pairs(y_hat, linear.outputs, in_y));
     linear.accumulate(factors, gradient);
     gradient.add_bias(y_hat);
-    linear.backward(E::along(y_hat, in_y), x_hat);
+    linear.backward(E::pack_along_k(y_hat, in_y), x_hat);
 }

@@ -1,15 +1,15 @@
 //! The rectified linear unit, and what it leaves open.
 
-use super::real::Real;
+use crate::engine::simd::element::Element;
 use pulp::{Arch, Simd, WithSimd};
 
 /// relu(x), in place. What is not a number stays so, for somebody to see.
-pub fn rectify<T: Real>(x: &mut [T]) {
+pub fn rectify<T: Element>(x: &mut [T]) {
     Arch::new().dispatch(Rectify { x });
 }
 
 /// The derivative of [`rectify`] times `x`, where `rectified` is what it left.
-pub fn mask<T: Real>(x: &mut [T], rectified: &[T]) {
+pub fn mask<T: Element>(x: &mut [T], rectified: &[T]) {
     Arch::new().dispatch(Mask { x, rectified });
 }
 
@@ -32,7 +32,7 @@ impl Open {
 
     /// Looks through x, `[R, columns]`, in parts of so many columns. The unit left the first `rectified` of a row; the others
     /// are open whatever they are.
-    pub fn find<T: Real>(&mut self, x: &[T], columns: usize, rectified: usize, part: usize) {
+    pub fn find<T: Element>(&mut self, x: &[T], columns: usize, rectified: usize, part: usize) {
         (self.rows, self.part) = (x.len() / columns, part);
         // One more than there can be: what is not open is written all the same, and then written over.
         self.columns.resize(x.len() + 1, 0);
@@ -69,7 +69,7 @@ struct Rectify<'a, T> {
     x: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Rectify<'_, T> {
+impl<T: Element> WithSimd for Rectify<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -86,7 +86,7 @@ struct Mask<'a, T> {
     rectified: &'a [T],
 }
 
-impl<T: Real> WithSimd for Mask<'_, T> {
+impl<T: Element> WithSimd for Mask<'_, T> {
     type Output = ();
 
     #[inline(always)]

@@ -3,10 +3,11 @@
 //! Its inputs are what a rectified linear unit left, about half of them zero. Its outputs come in blocks of O; a block is not
 //! wanted where what it would be multiplied by is zero.
 
-use super::lanes::{Aligned, Lanes, grown, registers, registers_mut, zeros};
-use super::matrix::Shape;
-use super::real::Real;
+use crate::engine::simd::vector;
 use super::rectified::Open;
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::Element;
+use crate::engine::simd::vector::{Vector, VectorShape, registers, registers_mut};
 use pulp::{Arch, Simd, WithSimd};
 use std::ops::Range;
 
@@ -20,18 +21,18 @@ pub struct Sparse<T> {
     /// O.
     outputs: usize,
     /// `[blocks, K, O']`.
-    weight: Aligned<T>,
+    weight: AlignedVec<T>,
     /// `[blocks, O']`.
-    bias: Aligned<T>,
+    bias: AlignedVec<T>,
     /// As many.
-    zeros: Aligned<T>,
+    zeros: AlignedVec<T>,
 }
 
 /// What a loss changes by when the weights do, likewise.
 #[derive(Debug)]
 pub struct SparseGradient<T> {
-    pub weight: Aligned<T>,
-    pub bias: Aligned<T>,
+    pub weight: AlignedVec<T>,
+    pub bias: AlignedVec<T>,
 }
 
 /// Some blocks, for R = `rows` rows.
@@ -58,11 +59,11 @@ impl<'a> Part<'a> {
 }
 
 /// O rounded up to whole registers.
-pub fn padded<T: Real>(outputs: usize) -> usize {
-    outputs.next_multiple_of(Shape::of::<T>().lanes)
+pub fn padded<T: Element>(outputs: usize) -> usize {
+    outputs.next_multiple_of(VectorShape::of::<T>().lanes)
 }
 
-impl<T: Real> Sparse<T> {
+impl<T: Element> Sparse<T> {
     /// Of a weight `[O, blocks, K]` and a bias `[O, blocks]`.
     pub fn new(weight: &[T], bias: &[T], outputs: usize) -> Self {
         let (blocks, inputs, width) = (bias.len() / outputs, weight.len() / bias.len(), padded::<T>(outputs));
@@ -112,8 +113,8 @@ impl<T: Real> Sparse<T> {
 
     /// x̄ `[R, K]` of ȳ, which comes part by part, `[R, its blocks, O']`: the first begins anew, and after the last it is
     /// there. Until then `sums` has a register for each x̄ that is open, whose lanes are added up once for all parts.
-    pub fn backward(&self, part: &Part<'_>, open: &Open, y_bar: &[T], sums: &mut Aligned<T>, x_bar: &mut [T]) {
-        let sums = grown(sums, part.rows * self.inputs * Shape::of::<T>().lanes);
+    pub fn backward(&self, part: &Part<'_>, open: &Open, y_bar: &[T], sums: &mut AlignedVec<T>, x_bar: &mut [T]) {
+        let sums = resize(sums, part.rows * self.inputs * VectorShape::of::<T>().lanes);
         Arch::new().dispatch(Backward { layer: self, part, open, y_bar, sums });
         if part.blocks.end == self.blocks() {
             Arch::new().dispatch(AddUp { inputs: self.inputs, open, sums, x_bar });
@@ -158,23 +159,23 @@ impl<T: Real> Sparse<T> {
     /// Registers of O'.
     #[inline(always)]
     fn registers<S: Simd>(&self) -> usize {
-        self.width / Lanes::<S, T>::COUNT
+        self.width / Vector::<S, T>::COUNT
     }
 
     /// A block's weights, `[K, O']`, in tiles of W registers.
     #[inline(always)]
-    fn tiles<S: Simd, const W: usize>(&self, simd: S, block: usize) -> &[[T::Lanes<S>; W]] {
+    fn tiles<S: Simd, const W: usize>(&self, simd: S, block: usize) -> &[[T::Register<S>; W]] {
         let size = self.inputs * self.registers::<S>();
         let [weight] = registers(simd, [&self.weight[block * self.inputs * self.width..]], size);
         weight.as_chunks().0
     }
 }
 
-impl<T: Real> SparseGradient<T> {
+impl<T: Element> SparseGradient<T> {
     /// Adds another.
     pub fn add(&mut self, other: &Self) {
-        super::linear::add(&mut self.weight, &other.weight);
-        super::linear::add(&mut self.bias, &other.bias);
+        vector::add(&mut self.weight, &other.weight);
+        vector::add(&mut self.bias, &other.bias);
     }
 }
 
@@ -226,7 +227,7 @@ fn tiles<S: Simd, const W: usize>(simd: S, pass: &mut impl Pass<S>, r: usize, wa
 }
 
 /// Takes what a layer gives while it is still in registers.
-pub trait Taker<T: Real> {
+pub trait Taker<T: Element> {
     /// Tiles of W registers of P blocks of row r.
     fn take<S: Simd, const P: usize, const W: usize>(
         &mut self,
@@ -234,7 +235,7 @@ pub trait Taker<T: Real> {
         r: usize,
         blocks: [usize; P],
         tile: usize,
-        values: [[Lanes<S, T>; W]; P],
+        values: [[Vector<S, T>; W]; P],
     );
 }
 
@@ -249,7 +250,7 @@ struct Forward<'a, T, F> {
     taker: &'a mut F,
 }
 
-impl<T: Real, F: Taker<T>> WithSimd for Forward<'_, T, F> {
+impl<T: Element, F: Taker<T>> WithSimd for Forward<'_, T, F> {
     type Output = ();
 
     #[inline(always)]
@@ -259,27 +260,27 @@ impl<T: Real, F: Taker<T>> WithSimd for Forward<'_, T, F> {
     }
 }
 
-impl<S: Simd, T: Real, F: Taker<T>> Pass<S> for Forward<'_, T, F> {
+impl<S: Simd, T: Element, F: Taker<T>> Pass<S> for Forward<'_, T, F> {
     #[inline(always)]
     fn blocks<const P: usize, const W: usize>(&mut self, simd: S, r: usize, blocks: [usize; P], tile: usize) {
         let Self { layer, open, bias, x, taker, .. } = self;
         let (inputs, registers_of_block) = (layer.inputs, layer.registers::<S>());
         let tiles = registers_of_block / W;
         let x = &x[r * inputs..][..inputs];
-        let (mut weights, mut sums) = ([[].as_slice(); P], [[Lanes::splat(simd, T::ZERO); W]; P]);
+        let (mut weights, mut sums) = ([[].as_slice(); P], [[Vector::splat(simd, T::ZERO); W]; P]);
         for ((weight, sums), block) in weights.iter_mut().zip(&mut sums).zip(blocks) {
             *weight = layer.tiles::<S, W>(simd, block);
             let [bias] = registers(simd, [&bias[block * layer.width..]], registers_of_block);
             for (sum, bias) in sums.iter_mut().zip(&bias[tile * W..][..W]) {
-                [*sum] = Lanes::each(simd, [*bias]);
+                [*sum] = Vector::from_registers(simd, [*bias]);
             }
         }
         for k in open.row(0, r) {
             let k = *k as usize;
-            let x = Lanes::splat(simd, x[k]);
+            let x = Vector::splat(simd, x[k]);
             for (sums, weight) in sums.iter_mut().zip(weights) {
                 for (sum, a) in sums.iter_mut().zip(&weight[k * tiles + tile]) {
-                    *sum = x.mul_add(Lanes::each(simd, [*a])[0], *sum);
+                    *sum = x.mul_add(Vector::from_registers(simd, [*a])[0], *sum);
                 }
             }
         }
@@ -296,7 +297,7 @@ struct Backward<'a, T> {
     sums: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Backward<'_, T> {
+impl<T: Element> WithSimd for Backward<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -306,14 +307,14 @@ impl<T: Real> WithSimd for Backward<'_, T> {
     }
 }
 
-impl<S: Simd, T: Real> Pass<S> for Backward<'_, T> {
+impl<S: Simd, T: Element> Pass<S> for Backward<'_, T> {
     #[inline(always)]
     fn begin(&mut self, simd: S, r: usize) {
         let Self { layer, part, open, sums, .. } = self;
         if part.blocks.start == 0 {
             let [sums] = registers_mut(simd, [sums], part.rows * layer.inputs);
             for k in open.row(0, r) {
-                sums[r * layer.inputs + *k as usize] = Lanes::splat(simd, T::ZERO).values();
+                sums[r * layer.inputs + *k as usize] = Vector::splat(simd, T::ZERO).register();
             }
         }
     }
@@ -324,28 +325,28 @@ impl<S: Simd, T: Real> Pass<S> for Backward<'_, T> {
         let registers_of_block = layer.registers::<S>();
         let tiles = registers_of_block / W;
         let mut weights = [[].as_slice(); P];
-        let mut ys = [[Lanes::splat(simd, T::ZERO); W]; P];
+        let mut ys = [[Vector::splat(simd, T::ZERO); W]; P];
         for ((weight, ys), block) in weights.iter_mut().zip(&mut ys).zip(blocks) {
             *weight = layer.tiles::<S, W>(simd, block);
             let [y] = registers(simd, [&y_bar[part.at(r, block, layer.width)..]], registers_of_block);
             for (to, y) in ys.iter_mut().zip(&y[tile * W..][..W]) {
-                [*to] = Lanes::each(simd, [*y]);
+                [*to] = Vector::from_registers(simd, [*y]);
             }
         }
         let [sums] = registers_mut(simd, [sums], part.rows * layer.inputs);
         let sums = &mut sums[r * layer.inputs..][..layer.inputs];
         for k in open.row(0, r) {
             let k = *k as usize;
-            let [sum] = Lanes::each(simd, [sums[k]]);
+            let [sum] = Vector::from_registers(simd, [sums[k]]);
             // Two, since each waits for the one before.
-            let mut halves = [sum, Lanes::splat(simd, T::ZERO)];
+            let mut halves = [sum, Vector::splat(simd, T::ZERO)];
             for (p, (ys, weight)) in ys.iter().zip(weights).enumerate() {
                 for (w, (y, a)) in ys.iter().zip(&weight[k * tiles + tile]).enumerate() {
                     let half = (p * W + w) % 2;
-                    halves[half] = y.mul_add(Lanes::each(simd, [*a])[0], halves[half]);
+                    halves[half] = y.mul_add(Vector::from_registers(simd, [*a])[0], halves[half]);
                 }
             }
-            sums[k] = (halves[0] + halves[1]).values();
+            sums[k] = (halves[0] + halves[1]).register();
         }
     }
 }
@@ -358,7 +359,7 @@ struct AddUp<'a, T> {
     x_bar: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for AddUp<'_, T> {
+impl<T: Element> WithSimd for AddUp<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -369,7 +370,7 @@ impl<T: Real> WithSimd for AddUp<'_, T> {
         for (r, (x_bar, sums)) in x_bar.chunks_exact_mut(inputs).zip(sums.chunks_exact(inputs)).enumerate() {
             for k in open.row(0, r) {
                 let k = *k as usize;
-                x_bar[k] = Lanes::each(simd, [sums[k]])[0].sum();
+                x_bar[k] = Vector::from_registers(simd, [sums[k]])[0].sum();
             }
         }
     }
@@ -388,7 +389,7 @@ struct Accumulate<'a, T, const SECOND: bool> {
     gradient: &'a mut SparseGradient<T>,
 }
 
-impl<T: Real, const SECOND: bool> WithSimd for Accumulate<'_, T, SECOND> {
+impl<T: Element, const SECOND: bool> WithSimd for Accumulate<'_, T, SECOND> {
     type Output = ();
 
     #[inline(always)]
@@ -398,7 +399,7 @@ impl<T: Real, const SECOND: bool> WithSimd for Accumulate<'_, T, SECOND> {
     }
 }
 
-impl<S: Simd, T: Real, const SECOND: bool> Pass<S> for Accumulate<'_, T, SECOND> {
+impl<S: Simd, T: Element, const SECOND: bool> Pass<S> for Accumulate<'_, T, SECOND> {
     #[inline(always)]
     fn blocks<const P: usize, const W: usize>(&mut self, simd: S, r: usize, blocks: [usize; P], tile: usize) {
         let Self { layer, part, open, first, second, gradient } = self;
@@ -408,23 +409,23 @@ impl<S: Simd, T: Real, const SECOND: bool> Pass<S> for Accumulate<'_, T, SECOND>
         for block in blocks {
             let lines = [first.1, second.1].map(|y| &y[part.at(r, block, width)..]);
             let [y_hat, y_bar] = registers(simd, lines, count).map(|y| &y[at..][..W]);
-            let (mut ys, mut y_bars) = ([Lanes::splat(simd, T::ZERO); W], [Lanes::splat(simd, T::ZERO); W]);
+            let (mut ys, mut y_bars) = ([Vector::splat(simd, T::ZERO); W], [Vector::splat(simd, T::ZERO); W]);
             let [bias] = registers_mut(simd, [&mut gradient.bias[block * width..]], count);
             for w in 0..W {
-                [ys[w], y_bars[w]] = Lanes::each(simd, [y_hat[w], y_bar[w]]);
-                bias[at + w] = (Lanes::each(simd, [bias[at + w]])[0] + ys[w]).values();
+                [ys[w], y_bars[w]] = Vector::from_registers(simd, [y_hat[w], y_bar[w]]);
+                bias[at + w] = (Vector::from_registers(simd, [bias[at + w]])[0] + ys[w]).register();
             }
             let [weight] = registers_mut(simd, [&mut gradient.weight[block * inputs * width..]], inputs * count);
             for k in open.row(0, r) {
                 let k = *k as usize;
-                let (x, x_dot) = (Lanes::splat(simd, x[k]), Lanes::splat(simd, x_dot[k]));
+                let (x, x_dot) = (Vector::splat(simd, x[k]), Vector::splat(simd, x_dot[k]));
                 let line = &mut weight[k * count + at..][..W];
                 for w in 0..W {
-                    let mut sum = x.mul_add(ys[w], Lanes::each(simd, [line[w]])[0]);
+                    let mut sum = x.mul_add(ys[w], Vector::from_registers(simd, [line[w]])[0]);
                     if SECOND {
                         sum = x_dot.mul_add(y_bars[w], sum);
                     }
-                    line[w] = sum.values();
+                    line[w] = sum.register();
                 }
             }
         }

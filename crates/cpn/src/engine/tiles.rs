@@ -9,8 +9,8 @@
 //! an adjoint, which leads a loss' gradient in what the step gives back to one in what it takes. But for the last step, all go
 //! through the points of one direction one after the other, so that what they leave for the products lies near.
 
-use super::lanes::{Lanes, registers, registers_mut};
-use super::real::Real;
+use crate::engine::simd::element::Element;
+use crate::engine::simd::vector::{Vector, registers, registers_mut};
 use pulp::{Arch, Simd, WithSimd};
 use std::array;
 
@@ -83,17 +83,17 @@ impl Tiles {
 
     /// From images to d, combined in both directions, down at one point: for each across `[tiles, D]`, with [`BEYOND`] numbers
     /// behind it and behind the images.
-    pub fn enter<T: Real>(&self, point: usize, x: &[T], d: &mut [T], room: &mut [T]) {
+    pub fn enter<T: Element>(&self, point: usize, x: &[T], d: &mut [T], room: &mut [T]) {
         Arch::new().dispatch(Enter { tiles: self, point, x, d, room });
     }
 
     /// Adds to x̂ what d̂ at a point gives.
-    pub fn enter_adjoint<T: Real>(&self, point: usize, d: &[T], x: &mut [T], room: &mut [T]) {
+    pub fn enter_adjoint<T: Element>(&self, point: usize, d: &[T], x: &mut [T], room: &mut [T]) {
         Arch::new().dispatch(EnterAdjoint { tiles: self, point, d, x, room });
     }
 
     /// From p, for each pair of points `[tiles, O]`, to outputs, rectified.
-    pub fn leave<T: Real>(&self, p: &[T], y: &mut [T], room: &mut [T]) {
+    pub fn leave<T: Element>(&self, p: &[T], y: &mut [T], room: &mut [T]) {
         match self.kept {
             2 => Arch::new().dispatch(Leave::<T, 2> { tiles: self, p, y, room }),
             _ => Arch::new().dispatch(Leave::<T, 3> { tiles: self, p, y, room }),
@@ -101,7 +101,7 @@ impl Tiles {
     }
 
     /// Writes p̂, down at one point, from ŷ, which is a gradient in what the unit takes.
-    pub fn leave_adjoint<T: Real>(&self, point: usize, y: &[T], p: &mut [T], room: &mut [T]) {
+    pub fn leave_adjoint<T: Element>(&self, point: usize, y: &[T], p: &mut [T], room: &mut [T]) {
         match self.kept {
             2 => Arch::new().dispatch(LeaveAdjoint::<T, 2> { tiles: self, point, y, p, room }),
             _ => Arch::new().dispatch(LeaveAdjoint::<T, 3> { tiles: self, point, y, p, room }),
@@ -119,7 +119,7 @@ struct Enter<'a, T> {
     room: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for Enter<'_, T> {
+impl<T: Element> WithSimd for Enter<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -152,7 +152,7 @@ struct EnterAdjoint<'a, T> {
     room: &'a mut [T],
 }
 
-impl<T: Real> WithSimd for EnterAdjoint<'_, T> {
+impl<T: Element> WithSimd for EnterAdjoint<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -187,7 +187,7 @@ struct Leave<'a, T, const KEPT: usize> {
     room: &'a mut [T],
 }
 
-impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
+impl<T: Element, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
     type Output = ();
 
     #[inline(always)]
@@ -208,7 +208,7 @@ impl<T: Real, const KEPT: usize> WithSimd for Leave<'_, T, KEPT> {
                     let column = |j| &half[j * outputs..];
                     let into = &mut image[((top + i) * size + left) * outputs..][..KEPT * outputs];
                     let columns = [column(0), column(1), column(2), column(3)];
-                    keep(simd, outputs, columns, parts::<T, KEPT>(into), Lanes::rectified);
+                    keep(simd, outputs, columns, parts::<T, KEPT>(into), Vector::relu);
                 }
                 tile += 1;
             }
@@ -225,7 +225,7 @@ struct LeaveAdjoint<'a, T, const KEPT: usize> {
     room: &'a mut [T],
 }
 
-impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
+impl<T: Element, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
     type Output = ();
 
     #[inline(always)]
@@ -256,41 +256,41 @@ impl<T: Real, const KEPT: usize> WithSimd for LeaveAdjoint<'_, T, KEPT> {
 
 /// Of d in a row, each `length` numbers, what the products are made of.
 #[inline(always)]
-fn combine<S: Simd, T: Real>(simd: S, length: usize, d: [&[T]; POINTS], into: [&mut [T]; POINTS]) {
-    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+fn combine<S: Simd, T: Element>(simd: S, length: usize, d: [&[T]; POINTS], into: [&mut [T]; POINTS]) {
+    let count = length.div_ceil(Vector::<S, T>::COUNT);
     let d = registers(simd, d, count);
     let into = registers_mut(simd, into, count);
     for i in 0..count {
-        let [d0, d1, d2, d3] = Lanes::<S, T>::each(simd, [d[0][i], d[1][i], d[2][i], d[3][i]]);
-        into[0][i] = (d0 - d2).values();
-        into[1][i] = (d1 + d2).values();
-        into[2][i] = (d2 - d1).values();
-        into[3][i] = (d1 - d3).values();
+        let [d0, d1, d2, d3] = Vector::<S, T>::from_registers(simd, [d[0][i], d[1][i], d[2][i], d[3][i]]);
+        into[0][i] = (d0 - d2).register();
+        into[1][i] = (d1 + d2).register();
+        into[2][i] = (d2 - d1).register();
+        into[3][i] = (d1 - d3).register();
     }
 }
 
 /// The same at one point alone, of d that lie one after the other.
 #[inline(always)]
-fn combine_at<S: Simd, T: Real>(simd: S, point: usize, length: usize, d: &[T], into: &mut [T]) {
+fn combine_at<S: Simd, T: Element>(simd: S, point: usize, length: usize, d: &[T], into: &mut [T]) {
     let (first, second, sign) = COMBINED[point];
-    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let count = length.div_ceil(Vector::<S, T>::COUNT);
     let d = registers(simd, [&d[first * length..], &d[second * length..]], count);
     let [into] = registers_mut(simd, [into], count);
-    let sign = Lanes::splat(simd, T::from_f64(sign.into()));
+    let sign = Vector::splat(simd, T::from_f64(sign.into()));
     for i in 0..count {
-        let [first, second] = Lanes::<S, T>::each(simd, [d[0][i], d[1][i]]);
-        into[i] = sign.mul_add(second, first).values();
+        let [first, second] = Vector::<S, T>::from_registers(simd, [d[0][i], d[1][i]]);
+        into[i] = sign.mul_add(second, first).register();
     }
 }
 
 /// Adds to d̂, from what the products were made of at one point.
 #[inline(always)]
-fn combine_at_adjoint<S: Simd, T: Real>(simd: S, point: usize, from: &[T], d: &mut [T]) {
+fn combine_at_adjoint<S: Simd, T: Element>(simd: S, point: usize, from: &[T], d: &mut [T]) {
     let (first, second, sign) = COMBINED[point];
     let d = parts::<T, POINTS>(d);
-    let sign = Lanes::splat(simd, T::from_f64(sign.into()));
-    for at in (0..from.len()).step_by(Lanes::<S, T>::COUNT) {
-        let p = Lanes::load(simd, &from[at..]);
+    let sign = Vector::splat(simd, T::from_f64(sign.into()));
+    for at in (0..from.len()).step_by(Vector::<S, T>::COUNT) {
+        let p = Vector::load(simd, &from[at..]);
         p.add_to(&mut d[first][at..]);
         (sign * p).add_to(&mut d[second][at..]);
     }
@@ -298,84 +298,84 @@ fn combine_at_adjoint<S: Simd, T: Real>(simd: S, point: usize, from: &[T], d: &m
 
 /// Adds to d̂ in a row, from what the products were made of.
 #[inline(always)]
-fn combine_adjoint<S: Simd, T: Real>(simd: S, from: [&[T]; POINTS], d: [&mut [T]; POINTS]) {
+fn combine_adjoint<S: Simd, T: Element>(simd: S, from: [&[T]; POINTS], d: [&mut [T]; POINTS]) {
     let [d0, d1, d2, d3] = d;
-    for at in (0..d0.len()).step_by(Lanes::<S, T>::COUNT) {
+    for at in (0..d0.len()).step_by(Vector::<S, T>::COUNT) {
         let mut rest = from;
         for from in &mut rest {
             *from = &from[at..];
         }
-        let [p0, p1, p2, p3] = Lanes::<S, T>::load_each(simd, rest);
+        let [p0, p1, p2, p3] = Vector::<S, T>::load_each(simd, rest);
         p0.add_to(&mut d0[at..]);
         (p1 - p2 + p3).add_to(&mut d1[at..]);
         (p1 + p2 - p0).add_to(&mut d2[at..]);
-        (Lanes::splat(simd, T::ZERO) - p3).add_to(&mut d3[at..]);
+        (Vector::splat(simd, T::ZERO) - p3).add_to(&mut d3[at..]);
     }
 }
 
 /// Of p in a row, each `length` numbers, what it adds up to.
 #[inline(always)]
-fn keep<S: Simd, T: Real, const KEPT: usize>(
+fn keep<S: Simd, T: Element, const KEPT: usize>(
     simd: S,
     length: usize,
     p: [&[T]; POINTS],
     into: [&mut [T]; KEPT],
-    finish: impl Fn(Lanes<S, T>) -> Lanes<S, T>,
+    finish: impl Fn(Vector<S, T>) -> Vector<S, T>,
 ) {
-    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let count = length.div_ceil(Vector::<S, T>::COUNT);
     let p = registers(simd, p, count);
     let into = registers_mut(simd, into, count);
     for i in 0..count {
-        let [p0, p1, p2, p3] = Lanes::<S, T>::each(simd, [p[0][i], p[1][i], p[2][i], p[3][i]]);
+        let [p0, p1, p2, p3] = Vector::<S, T>::from_registers(simd, [p[0][i], p[1][i], p[2][i], p[3][i]]);
         let (sum, difference) = (p1 + p2, p1 - p2);
-        into[0][i] = finish(p0 + sum).values();
-        into[1][i] = finish(if KEPT == 2 { difference - p3 } else { difference }).values();
+        into[0][i] = finish(p0 + sum).register();
+        into[1][i] = finish(if KEPT == 2 { difference - p3 } else { difference }).register();
         if KEPT == 3 {
-            into[2][i] = finish(sum - p3).values();
+            into[2][i] = finish(sum - p3).register();
         }
     }
 }
 
 /// Of ŷ in a row, each `length` numbers, p̂.
 #[inline(always)]
-fn keep_adjoint<S: Simd, T: Real, const KEPT: usize>(
+fn keep_adjoint<S: Simd, T: Element, const KEPT: usize>(
     simd: S,
     length: usize,
     y: [&[T]; KEPT],
     into: [&mut [T]; POINTS],
 ) {
-    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let count = length.div_ceil(Vector::<S, T>::COUNT);
     let y = registers(simd, y, count);
     let into = registers_mut(simd, into, count);
     for i in 0..count {
-        let [first, second, last] = Lanes::<S, T>::each(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
+        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
         let even = if KEPT == 2 { first } else { first + last };
-        into[0][i] = first.values();
-        into[1][i] = (even + second).values();
-        into[2][i] = (even - second).values();
-        into[3][i] = (Lanes::splat(simd, T::ZERO) - last).values();
+        into[0][i] = first.register();
+        into[1][i] = (even + second).register();
+        into[2][i] = (even - second).register();
+        into[3][i] = (Vector::splat(simd, T::ZERO) - last).register();
     }
 }
 
 /// The same at one point alone.
 #[inline(always)]
-fn keep_at_adjoint<S: Simd, T: Real, const KEPT: usize>(
+fn keep_at_adjoint<S: Simd, T: Element, const KEPT: usize>(
     simd: S,
     point: usize,
     length: usize,
     y: [&[T]; KEPT],
     into: &mut [T],
 ) {
-    let count = length.div_ceil(Lanes::<S, T>::COUNT);
+    let count = length.div_ceil(Vector::<S, T>::COUNT);
     let y = registers(simd, y, count);
     let [into] = registers_mut(simd, [into], count);
     // What p at this point is in the first, the second and the last.
     let shares = [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, -1.0]][point];
     let shares = if KEPT == 2 && point != 3 { [shares[0], shares[1], 0.0] } else { shares };
-    let shares = shares.map(|share| Lanes::splat(simd, T::from_f64(share)));
+    let shares = shares.map(|share| Vector::splat(simd, T::from_f64(share)));
     for i in 0..count {
-        let [first, second, last] = Lanes::<S, T>::each(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
-        into[i] = shares[2].mul_add(last, shares[1].mul_add(second, shares[0] * first)).values();
+        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
+        into[i] = shares[2].mul_add(last, shares[1].mul_add(second, shares[0] * first)).register();
     }
 }
 

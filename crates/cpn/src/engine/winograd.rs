@@ -4,10 +4,9 @@
 //! [Tiles](super::tiles) of 4 x 4 blocks give m x m outputs, m = 5 - r, by 16 products for each pair of channels, where patches
 //! take 36: each is a linear layer of its own, whose weights are sums of taps.
 
-use super::factor::Factor;
-use super::lanes::{Aligned, grown, zeros};
 use super::linear::{Linear, LinearGradient};
-use super::real::Real;
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::{Element, Operand};
 use super::tiles::{BEYOND, ONES, PAIRS, POINTS, Tiles};
 use std::array;
 
@@ -17,7 +16,7 @@ const AT_ONCE: usize = 64;
 
 /// A convolution over images whose channels lie together, `[S, S, C]`, and a rectified linear unit; E is what is multiplied.
 #[derive(Debug)]
-pub struct Winograd<E: Factor> {
+pub struct Winograd<E: Operand> {
     tiles: Tiles,
     /// r.
     taps: usize,
@@ -25,34 +24,34 @@ pub struct Winograd<E: Factor> {
     points: Vec<Layer<E>>,
 }
 
-type Layer<E> = Linear<E, <E as Factor>::Sum>;
+type Layer<E> = Linear<E, <E as Operand>::Sum>;
 
 /// Room for what lies between an image and its outputs, kept from image to image.
 #[derive(Debug)]
-pub struct Room<E: Factor> {
+pub struct Room<E: Operand> {
     numbers: Numbers<E::Sum>,
     /// d and p as factors, if they are not multiplied as they are.
-    factors: [Aligned<E>; 2],
+    factors: [AlignedVec<E>; 2],
 }
 
 #[derive(Debug)]
 struct Numbers<T> {
     /// What [`Tiles`] works in.
-    tiles: Aligned<T>,
+    tiles: AlignedVec<T>,
     /// d or d̂, down at one point, for each across `[tiles, D]`, with [`BEYOND`] numbers behind them.
-    d: Aligned<T>,
+    d: AlignedVec<T>,
     /// p or p̂, for each pair of points `[tiles, O]`.
-    p: Aligned<T>,
+    p: AlignedVec<T>,
 }
 
-impl<E: Factor> Room<E> {
+impl<E: Operand> Room<E> {
     /// Empty.
     pub fn new() -> Self {
         Self { numbers: Numbers { tiles: zeros(0), d: zeros(0), p: zeros(0) }, factors: [zeros(0), zeros(0)] }
     }
 }
 
-impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
+impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
     /// Of S = `side` and C = `channels`, with `weight`, `[O, C, K, K]`, and `bias`, `[O]`; None where this does not apply.
     pub fn new(
         (side, channels): (usize, usize),
@@ -61,7 +60,7 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
         bias: &[T],
     ) -> Option<Self> {
         let taps = kernel / stride;
-        let are_factors = (stride * stride * channels).is_multiple_of(E::NUMBERS);
+        let are_factors = (stride * stride * channels).is_multiple_of(E::PACK);
         if !are_factors || kernel != taps * stride || !(2..=3).contains(&taps) || !bias.len().is_multiple_of(BEYOND) {
             return None;
         }
@@ -83,7 +82,7 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
             for (point, p) in p.chunks_exact_mut(p.len() / POINTS).enumerate() {
                 self.tiles.enter(point, &x[i * images * inputs..], d, inner);
                 for (pair, layer, (d, p)) in self.layers(point, d, p) {
-                    let d = E::along(d, &mut room.factors[0]);
+                    let d = E::pack_along_k(d, &mut room.factors[0]);
                     if pair == ONES {
                         layer.forward(d, p);
                     } else {
@@ -118,13 +117,13 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
                 self.tiles.enter(point, &x[i * images * inputs..], d, inner);
                 self.tiles.leave_adjoint(point, y_hat, p, inner);
                 for (pair, layer, (d, p)) in self.layers(point, d, p) {
-                    let factors = (E::across(d, layer.inputs, in_d), E::across(p, layer.outputs, in_p));
+                    let factors = (E::pack_row_pairs(d, layer.inputs, in_d), E::pack_row_pairs(p, layer.outputs, in_p));
                     layer.accumulate(factors, &mut gradient[pair]);
                     if pair == ONES {
                         gradient[pair].add_bias(p);
                     }
                     if x_hat.is_some() {
-                        layer.backward(E::along(p, in_p), d);
+                        layer.backward(E::pack_along_k(p, in_p), d);
                     }
                 }
                 if let Some(x_hat) = &mut x_hat {
@@ -160,8 +159,8 @@ impl<T: Real, E: Factor<Sum = T>> Winograd<E> {
 
     fn room<'a>(&self, images: usize, room: &'a mut Numbers<T>) -> [&'a mut [T]; 3] {
         let (tiles, layer) = (images * self.tiles.in_image(), &self.points[0]);
-        let d = grown(&mut room.d, POINTS * (tiles * layer.inputs + BEYOND));
-        [grown(&mut room.tiles, self.tiles.room()), d, grown(&mut room.p, PAIRS * tiles * layer.outputs)]
+        let d = resize(&mut room.d, POINTS * (tiles * layer.inputs + BEYOND));
+        [resize(&mut room.tiles, self.tiles.room()), d, resize(&mut room.p, PAIRS * tiles * layer.outputs)]
     }
 
     /// The layers, down at one point, with what belongs to them, and which of all pairs they are of.
@@ -194,7 +193,7 @@ fn places(tiles: &Tiles, taps: usize, (i, j): (usize, usize)) -> Vec<usize> {
 }
 
 /// g(t) = Σ gᵢ tⁱ of two or three taps at each point, halved at 1 and -1; at ∞ it is the last tap.
-fn at_points<T: Real>(taps: Vec<Vec<T>>) -> [Vec<T>; POINTS] {
+fn at_points<T: Element>(taps: Vec<Vec<T>>) -> [Vec<T>; POINTS] {
     let (first, second, last) = (&taps[0], &taps[1], &taps[taps.len() - 1]);
     let even = if taps.len() == 2 { first } else { &sums(first, last) };
     let [one, minus_one] = halves(even, second);
@@ -202,7 +201,7 @@ fn at_points<T: Real>(taps: Vec<Vec<T>>) -> [Vec<T>; POINTS] {
 }
 
 /// [`at_points`] turned round: what a loss changes by with each tap, from what it changes by with g at each point.
-fn in_taps<T: Real>(taps: usize, [zero, one, minus_one, infinity]: [&[T]; POINTS]) -> Vec<Vec<T>> {
+fn in_taps<T: Element>(taps: usize, [zero, one, minus_one, infinity]: [&[T]; POINTS]) -> Vec<Vec<T>> {
     let [even, odd] = halves(one, minus_one);
     if taps == 2 {
         vec![sums(zero, &even), sums(&odd, infinity)]
@@ -211,12 +210,12 @@ fn in_taps<T: Real>(taps: usize, [zero, one, minus_one, infinity]: [&[T]; POINTS
     }
 }
 
-fn sums<T: Real>(a: &[T], b: &[T]) -> Vec<T> {
+fn sums<T: Element>(a: &[T], b: &[T]) -> Vec<T> {
     a.iter().zip(b).map(|(a, b)| *a + *b).collect()
 }
 
 /// (a + b) / 2 and (a - b) / 2.
-fn halves<T: Real>(a: &[T], b: &[T]) -> [Vec<T>; 2] {
+fn halves<T: Element>(a: &[T], b: &[T]) -> [Vec<T>; 2] {
     let half = T::ONE / T::count(2);
     let pairs = || a.iter().zip(b);
     [pairs().map(|(a, b)| (*a + *b) * half).collect(), pairs().map(|(a, b)| (*a - *b) * half).collect()]

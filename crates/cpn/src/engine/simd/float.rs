@@ -1,66 +1,13 @@
-//! The numbers that the engine is written in: float32 to train with, float64 to check it by.
+//! float32 and float64 as [`Operand`] and [`Element`].
 
-use super::factor::Factor;
-use super::lanes::Aligned;
-use super::pair::Pair;
+use super::bf16::Bf16x2;
+use super::buffer::AlignedVec;
+use super::element::{Element, Operand};
 use pulp::Simd;
-use std::iter::Sum;
-use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
-/// A floating-point number, and registers full of it.
-pub trait Real:
-    Factor<Sum = Self>
-    + PartialOrd
-    + Add<Output = Self>
-    + Sub<Output = Self>
-    + Mul<Output = Self>
-    + Div<Output = Self>
-    + Neg<Output = Self>
-    + AddAssign
-    + SubAssign
-    + Sum
-{
-    /// What products may multiply in its place, more coarsely.
-    type Half: Factor<Sum = Self>;
-    /// 1.
-    const ONE: Self;
-
-    /// A count as a number.
-    fn count(n: usize) -> Self;
-    /// A whole number.
-    fn from_u8(value: u8) -> Self;
-    /// The nearest number.
-    fn from_f64(value: f64) -> Self;
-    /// The hyperbolic tangent.
-    fn tanh(self) -> Self;
-    /// The square root.
-    fn sqrt(self) -> Self;
-    /// 1 / (1 + e^-x).
-    fn sigmoid(self) -> Self;
-
-    /// Writes over the first numbers of a slice, as many as it has.
-    fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: Self::Lanes<S>);
-    /// As many whole registers as a slice fills.
-    fn registers<S: Simd>(simd: S, slice: &[Self]) -> &[Self::Lanes<S>];
-    /// The same, to be written.
-    fn registers_mut<S: Simd>(simd: S, slice: &mut [Self]) -> &mut [Self::Lanes<S>];
-    /// a + b.
-    fn add_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
-    /// a - b.
-    fn sub_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
-    /// a b.
-    fn mul_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
-    /// The larger of a and b; b where one is not a number.
-    fn max_lanes<S: Simd>(simd: S, a: Self::Lanes<S>, b: Self::Lanes<S>) -> Self::Lanes<S>;
-    /// The sum of all.
-    fn sum_lanes<S: Simd>(simd: S, lanes: Self::Lanes<S>) -> Self;
-    /// σ of each.
-    fn sigmoids<S: Simd>(simd: S, lanes: Self::Lanes<S>) -> Self::Lanes<S>;
-}
-
-/// What differs between the two kinds only in the names of the library's functions.
-macro_rules! real {
-    ($real:ident, $lanes:ident, $count:ident, $as_simd:ident, $as_mut_simd:ident, $partial_store:ident, $add:ident, $sub:ident,
+/// The methods of [`Element`] that differ only in the names of pulp's functions.
+macro_rules! element {
+    ($float:ident, $register:ident, $count:ident, $as_simd:ident, $as_mut_simd:ident, $partial_store:ident, $add:ident, $sub:ident,
      $mul:ident, $max:ident, $sum:ident) => {
         const ONE: Self = 1.0;
 
@@ -95,95 +42,95 @@ macro_rules! real {
         }
 
         #[inline(always)]
-        fn store<S: Simd>(simd: S, slice: &mut [Self], lanes: S::$lanes) {
+        fn store<S: Simd>(simd: S, slice: &mut [Self], register: S::$register) {
             match slice.get_mut(..S::$count).map(S::$as_mut_simd) {
-                Some(([first], _)) => *first = lanes,
-                _ => simd.$partial_store(slice, lanes),
+                Some(([first], _)) => *first = register,
+                _ => simd.$partial_store(slice, register),
             }
         }
 
         #[inline(always)]
-        fn registers<S: Simd>(_: S, slice: &[Self]) -> &[S::$lanes] {
+        fn registers<S: Simd>(_: S, slice: &[Self]) -> &[S::$register] {
             S::$as_simd(slice).0
         }
 
         #[inline(always)]
-        fn registers_mut<S: Simd>(_: S, slice: &mut [Self]) -> &mut [S::$lanes] {
+        fn registers_mut<S: Simd>(_: S, slice: &mut [Self]) -> &mut [S::$register] {
             S::$as_mut_simd(slice).0
         }
 
         #[inline(always)]
-        fn add_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+        fn add_registers<S: Simd>(simd: S, a: S::$register, b: S::$register) -> S::$register {
             simd.$add(a, b)
         }
 
         #[inline(always)]
-        fn sub_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+        fn sub_registers<S: Simd>(simd: S, a: S::$register, b: S::$register) -> S::$register {
             simd.$sub(a, b)
         }
 
         #[inline(always)]
-        fn mul_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+        fn mul_registers<S: Simd>(simd: S, a: S::$register, b: S::$register) -> S::$register {
             simd.$mul(a, b)
         }
 
         #[inline(always)]
-        fn max_lanes<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes) -> S::$lanes {
+        fn max_registers<S: Simd>(simd: S, a: S::$register, b: S::$register) -> S::$register {
             simd.$max(a, b)
         }
 
         #[inline(always)]
-        fn sum_lanes<S: Simd>(simd: S, lanes: S::$lanes) -> Self {
-            simd.$sum(lanes)
+        fn sum_register<S: Simd>(simd: S, register: S::$register) -> Self {
+            simd.$sum(register)
         }
     };
 }
 
-/// A number as it is.
-macro_rules! factor {
-    ($real:ident, $lanes:ident, $count:ident, $splat:ident, $as_simd:ident, $partial_load:ident, $mul_add:ident) => {
-        impl Factor for $real {
+/// A number as its own operand: packing leaves it as it is.
+macro_rules! operand {
+    ($float:ident, $register:ident, $count:ident, $splat:ident, $as_simd:ident, $partial_load:ident, $mul_add:ident) => {
+        impl Operand for $float {
             type Sum = Self;
-            type Lanes<S: Simd> = S::$lanes;
-            const NUMBERS: usize = 1;
+            type Register<S: Simd> = S::$register;
+            const PACK: usize = 1;
             const ZERO: Self = 0.0;
 
             #[inline(always)]
-            fn splat<S: Simd>(simd: S, value: Self) -> S::$lanes {
+            fn splat<S: Simd>(simd: S, value: Self) -> S::$register {
                 simd.$splat(value)
             }
 
             #[inline(always)]
-            fn load<S: Simd>(simd: S, slice: &[Self]) -> S::$lanes {
+            fn load<S: Simd>(simd: S, slice: &[Self]) -> S::$register {
                 match slice.get(..S::$count).map(S::$as_simd) {
-                    Some((&[lanes], _)) => lanes,
+                    Some((&[register], _)) => register,
                     _ => simd.$partial_load(slice),
                 }
             }
 
             #[inline(always)]
-            fn mul_add<S: Simd>(simd: S, a: S::$lanes, b: S::$lanes, c: S::$lanes) -> S::$lanes {
+            fn mul_add<S: Simd>(simd: S, a: S::$register, b: S::$register, c: S::$register) -> S::$register {
                 simd.$mul_add(a, b, c)
             }
 
-            fn along<'a>(numbers: &'a [Self], _: &'a mut Aligned<Self>) -> &'a [Self] {
+            fn pack_along_k<'a>(numbers: &'a [Self], _: &'a mut AlignedVec<Self>) -> &'a [Self] {
                 numbers
             }
 
-            fn across<'a>(numbers: &'a [Self], _: usize, _: &'a mut Aligned<Self>) -> &'a [Self] {
+            fn pack_row_pairs<'a>(numbers: &'a [Self], _: usize, _: &'a mut AlignedVec<Self>) -> &'a [Self] {
                 numbers
             }
         }
     };
 }
 
-factor!(f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, partial_load_f64s, mul_add_f64s);
-factor!(f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, partial_load_f32s, mul_add_f32s);
+operand!(f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, partial_load_f64s, mul_add_f64s);
+operand!(f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, partial_load_f32s, mul_add_f32s);
 
-impl Real for f64 {
-    /// It is there to check by.
+impl Element for f64 {
+    /// Itself: float64 is there for checks.
     type Half = Self;
-    real!(
+    element!(
         f64,
         f64s,
         F64_LANES,
@@ -198,17 +145,17 @@ impl Real for f64 {
     );
 
     #[inline(always)]
-    fn sigmoids<S: Simd>(simd: S, lanes: S::f64s) -> S::f64s {
+    fn sigmoid_register<S: Simd>(simd: S, register: S::f64s) -> S::f64s {
         // The widest registers hold eight; this is only for checks.
         let mut values = [0.0; 8];
-        simd.partial_store_f64s(&mut values[..S::F64_LANES], lanes);
-        simd.partial_load_f64s(&values.map(Real::sigmoid)[..S::F64_LANES])
+        simd.partial_store_f64s(&mut values[..S::F64_LANES], register);
+        simd.partial_load_f64s(&values.map(Element::sigmoid)[..S::F64_LANES])
     }
 }
 
-impl Real for f32 {
-    type Half = Pair;
-    real!(
+impl Element for f32 {
+    type Half = Bf16x2;
+    element!(
         f32,
         f32s,
         F32_LANES,
@@ -222,24 +169,27 @@ impl Real for f32 {
         reduce_sum_f32s
     );
 
-    /// To about two units in the last place: e^-x is 2^n times a polynomial of the rest, which lies within half a power of two
-    /// (minimax in the relative error, by Lawson's iteration).
+    /// The sigmoid to about two units in the last place: e^-x is 2^n times a polynomial of the rest, which lies within half a
+    /// power of two (minimax in the relative error, by Lawson's iteration).
     #[inline(always)]
-    fn sigmoids<S: Simd>(simd: S, lanes: S::f32s) -> S::f32s {
+    fn sigmoid_register<S: Simd>(simd: S, register: S::f32s) -> S::f32s {
         let splat = |value: f32| simd.splat_f32s(value);
-        // Beyond, float32 has neither room nor digits; the sigmoid is 0 or 1 long before. Not a number stays so.
-        let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-88.0), lanes));
+
+        // Range reduction. Beyond ±88 float32 has neither room nor digits; the sigmoid is 0 or 1 long before. NaN stays NaN.
+        let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-88.0), register));
         // Adding this rounds to a whole number, which then stands in the low bits, as an exponent does: 127 above.
         const ROUND: f32 = 12_582_912.0 + 127.0;
         let log2_e = splat(-std::f32::consts::LOG2_E);
         let shifted = simd.mul_add_f32s(x, log2_e, splat(ROUND));
         let rest = simd.mul_add_f32s(x, log2_e, simd.sub_f32s(splat(ROUND), shifted));
+
         // 2 to the rest, within 1.1e-7: a minimax polynomial.
         let mut power = splat(1.330_06e-3);
         for coefficient in [9.669_69e-3, 5.550_558e-2, 2.402_228_2e-1, std::f32::consts::LN_2, 1.0] {
             power = simd.mul_add_f32s(power, rest, splat(coefficient));
         }
-        // The higher bits go over the edge.
+
+        // 2^n: the shift drops the higher bits.
         let exponent = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(23));
         let scale = simd.transmute_f32s_u32s(exponent);
         simd.div_f32s(splat(1.0), simd.mul_add_f32s(power, scale, splat(1.0)))
@@ -253,15 +203,15 @@ mod tests {
 
     struct Sigmoids<'a, T>(&'a mut [T]);
 
-    impl<T: Real> WithSimd for Sigmoids<'_, T> {
+    impl<T: Element> WithSimd for Sigmoids<'_, T> {
         type Output = ();
 
         #[inline(always)]
         fn with_simd<S: Simd>(self, simd: S) {
-            let lanes = size_of::<T::Lanes<S>>() / size_of::<T>();
+            let lanes = size_of::<T::Register<S>>() / size_of::<T>();
             for chunk in self.0.chunks_mut(lanes) {
                 let values = T::load(simd, chunk);
-                T::store(simd, chunk, T::sigmoids(simd, values));
+                T::store(simd, chunk, T::sigmoid_register(simd, values));
             }
         }
     }
