@@ -4,11 +4,11 @@
 //! The weights of one input lie together. Where a sample's x_i is what a rectified linear unit has closed, none of them matters,
 //! in no pass: x_i is zero, so is ẋ_i, and nobody asks for x̄_i.
 
-use crate::engine::simd::vector;
 use super::gate::{Gate, GateGradient, GateTape};
 use super::linear::Weights;
 use super::modulation::{Backward, FirstAdjoint, Forward, SecondAdjoint, Tangent};
 use super::rectified::Open;
+use super::simd::vector;
 use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::Vector;

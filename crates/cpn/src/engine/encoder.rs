@@ -93,7 +93,7 @@ impl<T: Element> Tape<T> {
 
 impl<T: Element> Encoder<T> {
     /// Reads the weights of a valid configuration. Images are multiplied in this precision, positions as they are: there is
-    /// little to multiply, and a place needs more than 8 bits.
+    /// little to gemm, and a place needs more than 8 bits.
     pub fn new(config: &EncoderConfig, precision: Precision, weights: &impl Weights<T>) -> Self {
         let ((numbers, layers, channels), precision) = match config {
             EncoderConfig::Image(config) => (of_images(config, precision, weights), precision),

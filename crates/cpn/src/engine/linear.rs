@@ -1,7 +1,7 @@
 //! The fully connected layer y = a x + b, and the four passes that everything here is made of.
 
-use super::matrix::{Matrix, Panels};
-use super::product::{Left, multiply};
+use crate::engine::gemm::kernel::{Lhs, gemm};
+use crate::engine::gemm::packing::{BLayout, PackedB};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::{Element, Operand};
 use crate::engine::simd::vector::add;
@@ -20,7 +20,7 @@ pub struct Linear<E, T = E> {
     /// a, `[outputs, inputs]`, across its rows.
     weight: AlignedVec<E>,
     /// aᵀ, `[inputs, outputs]`, along a's rows: each product reads the one whose rows it runs along.
-    transposed: Panels<E>,
+    transposed: PackedB<E>,
     /// b, `[outputs]`.
     bias: Vec<T>,
 }
@@ -39,7 +39,7 @@ impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
     pub fn new(weight: &[T], bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
         let mut room = zeros(0);
-        let transposed = Panels::transposed(E::pack_along_k(weight, &mut room), inputs / E::PACK);
+        let transposed = PackedB::transposed(E::pack_along_k(weight, &mut room), inputs / E::PACK);
         let weight = AlignedVec::from_slice(0, E::pack_row_pairs(weight, inputs, &mut room));
         Self { inputs, outputs, weight, transposed, bias }
     }
@@ -49,28 +49,28 @@ impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
         for row in y.chunks_exact_mut(self.outputs) {
             row.copy_from_slice(&self.bias);
         }
-        multiply(true, y, Left::Rows(x), self.transposed.matrix());
+        gemm(true, y, Lhs::Rows(x), self.transposed.layout());
     }
 
     /// ẏ = a ẋ: how y changes as x does.
     pub fn tangent(&self, x_dot: &[E], y_dot: &mut [T]) {
-        multiply(false, y_dot, Left::Rows(x_dot), self.transposed.matrix());
+        gemm(false, y_dot, Lhs::Rows(x_dot), self.transposed.layout());
     }
 
     /// x̄ = aᵀ ȳ: how a loss changes with x, from how it changes with y.
     pub fn backward(&self, y_bar: &[E], x_bar: &mut [T]) {
-        multiply(false, x_bar, Left::Rows(y_bar), Matrix::new(&self.weight, self.inputs));
+        gemm(false, x_bar, Lhs::Rows(y_bar), BLayout::new(&self.weight, self.inputs));
     }
 
     /// The same, added to what is in x̄.
     pub fn add_backward(&self, y_bar: &[E], x_bar: &mut [T]) {
-        multiply(true, x_bar, Left::Rows(y_bar), Matrix::new(&self.weight, self.inputs));
+        gemm(true, x_bar, Lhs::Rows(y_bar), BLayout::new(&self.weight, self.inputs));
     }
 
     /// Adds ∂Φ/∂a to `gradient`, for Φ = ŷᵀy + ȳᵀẏ. `x` and `y` hold, across their rows, those of x and ŷ and, in the second
     /// order, those of ẋ and ȳ after them.
     pub fn accumulate(&self, (x, y): (&[E], &[E]), gradient: &mut LinearGradient<T>) {
-        multiply(true, &mut gradient.weight, Left::Turned(y), Matrix::new(x, self.inputs));
+        gemm(true, &mut gradient.weight, Lhs::Transposed(y), BLayout::new(x, self.inputs));
     }
 
     /// A gradient of zeros.

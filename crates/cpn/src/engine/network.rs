@@ -3,10 +3,10 @@
 use super::attenuated::Scratch;
 use super::dense::{Dense, DenseGradient, Order, Tape};
 use super::linear::Weights;
-use crate::engine::simd::vector::add;
 use super::rectified::{mask, rectify};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
+use crate::engine::simd::vector::add;
 use crate::config::ModelConfig;
 
 /// The layers of both branches.

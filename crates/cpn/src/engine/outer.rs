@@ -1,9 +1,9 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
-use crate::engine::simd::vector;
 use super::dense::Order;
 use super::inner::{Actions, Purpose, Rollout, clamp};
 use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
+use super::simd::vector;
 use crate::engine::simd::element::Element;
 
 /// What the rows of a batch are about.

@@ -3,8 +3,8 @@
 //! Its inputs are what a rectified linear unit left, about half of them zero. Its outputs come in blocks of O; a block is not
 //! wanted where what it would be multiplied by is zero.
 
-use crate::engine::simd::vector;
 use super::rectified::Open;
+use super::simd::vector;
 use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::{Vector, VectorShape, registers, registers_mut};
