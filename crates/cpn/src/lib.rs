@@ -33,6 +33,7 @@ pub mod loss;
 pub mod method;
 pub mod neuromodulated;
 pub mod positions;
+mod precision;
 pub mod recipe;
 mod unique;
 

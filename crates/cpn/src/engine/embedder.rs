@@ -1,10 +1,10 @@
 //! The encoder in training: forward over the frames of a batch, and back to its weights.
 
 use super::encoder::{Encoder, EncoderGradient, INPUTS, Tape};
-use super::linear::Weights;
-use crate::engine::simd::element::Element;
 use crate::config::EncoderConfig;
 use crate::encoder::Precision;
+use crate::engine::layers::linear::Weights;
+use crate::engine::simd::element::Element;
 use crate::method::Observed;
 use rayon::prelude::*;
 

@@ -1,17 +1,17 @@
 //! The encoder f_φ.
 
-use crate::engine::convolution;
-use super::convolution::{Convolution, turn};
-use super::linear::{Linear, LinearGradient, Weights};
-use super::norm::Norm;
-use super::readout::Readout;
-use super::rectified::{mask, rectify};
-use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
-use crate::engine::simd::element::Element;
-use super::tiles::BEYOND;
-use crate::engine::readout;
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::encoder::Precision;
+use crate::engine::layers::conv2d::{Conv2d, Conv2dWorkspace, transpose};
+use crate::engine::layers::conv2d_params::Conv2dParams;
+use crate::engine::layers::layer_norm::LayerNorm;
+use crate::engine::layers::linear::{Linear, LinearGradient, Weights};
+use crate::engine::layers::passes::Stacked;
+use crate::engine::layers::projection::{Projection, ProjectionWorkspace};
+use crate::engine::layers::relu::{relu, relu_mask};
+use crate::engine::layers::winograd_transform::PADDING;
+use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
+use crate::engine::simd::element::Element;
 use crate::images::{BYTES, CHANNELS, SIZE};
 use crate::method::Observed;
 use pulp::{Arch, Simd, WithSimd};
@@ -28,8 +28,8 @@ pub struct Encoder<T: Element> {
     layers: Vec<Layer<T>>,
     /// Of the features, which have their channels first in the checkpoint and last here: the weights are turned rather than they.
     channels: usize,
-    linear: Readout<T>,
-    norm: Option<Norm<T>>,
+    linear: Projection<T>,
+    norm: Option<LayerNorm<T>>,
 }
 
 /// What becomes of an input.
@@ -42,7 +42,7 @@ enum Numbers<T> {
 /// A layer, and the rectified linear unit behind it.
 #[derive(Debug)]
 enum Layer<T: Element> {
-    Convolution(Convolution<T>),
+    Convolution(Conv2d<T>),
     Linear(Linear<T>),
 }
 
@@ -57,7 +57,7 @@ pub struct EncoderGradient<T> {
 /// What the forward pass over inputs leaves.
 #[derive(Debug)]
 pub struct Tape<T: Element> {
-    /// For every [`INPUTS`] of them what each layer takes but the first, with [`BEYOND`] numbers behind it.
+    /// For every [`INPUTS`] of them what each layer takes but the first, with [`PADDING`] numbers behind it.
     groups: Vec<Vec<AlignedVec<T>>>,
     /// What the first layer takes: soon made again, and four times as large as the bytes that it is made of.
     first: AlignedVec<T>,
@@ -66,8 +66,8 @@ pub struct Tape<T: Element> {
     /// What is normalised, `[R, Z]`.
     x: Vec<T>,
     /// Room for the passes.
-    convolution: convolution::Room<T>,
-    linear: readout::Room<T>,
+    convolution: Conv2dWorkspace<T>,
+    linear: ProjectionWorkspace<T>,
     features_hat: AlignedVec<T>,
     /// x̂ of a layer, and of the one behind it.
     x_hat: AlignedVec<T>,
@@ -82,8 +82,8 @@ impl<T: Element> Tape<T> {
             first: zeros(0),
             features: zeros(0),
             x: Vec::new(),
-            convolution: convolution::Room::new(),
-            linear: readout::Room::new(),
+            convolution: Conv2dWorkspace::new(),
+            linear: ProjectionWorkspace::new(),
             features_hat: zeros(0),
             x_hat: zeros(0),
             y_hat: zeros(0),
@@ -100,9 +100,9 @@ impl<T: Element> Encoder<T> {
             EncoderConfig::Position(config) => (of_positions(config, weights), Precision::Float32),
         };
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.linear.{part}")));
-        let weight = turn(&weight, channels, weight.len() / bias.len() / channels);
-        let linear = Readout::new(&weight, bias, precision);
-        let norm = config.layer_norm().then(|| Norm::named("encoder.norm", weights));
+        let weight = transpose(&weight, channels, weight.len() / bias.len() / channels);
+        let linear = Projection::new(&weight, bias, precision);
+        let norm = config.layer_norm().then(|| LayerNorm::named("encoder.norm", weights));
         Self { numbers, layers, channels, linear, norm }
     }
 
@@ -140,12 +140,12 @@ impl<T: Element> Encoder<T> {
     ) {
         let rows = inputs.len();
         if let (Some(norm), Some(gradient)) = (&self.norm, &mut gradient.norm) {
-            norm.adjoint(&tape.x, &mut hat, gradient);
+            norm.vjp(&tape.x, &mut hat, gradient);
         }
         let group = INPUTS * self.linear.inputs;
         let features = &tape.features[..rows * self.linear.inputs];
         let features_hat = resize(&mut tape.features_hat, features.len());
-        self.linear.adjoint((features, &hat), features_hat, &mut gradient.linear, &mut tape.linear);
+        self.linear.vjp(features, &hat, features_hat, &mut gradient.linear, &mut tape.linear);
         let (Some((first, layers)), Some((in_first, in_layers))) =
             (self.layers.split_first(), gradient.layers.split_first_mut())
         else {
@@ -157,14 +157,14 @@ impl<T: Element> Encoder<T> {
             resize(&mut tape.y_hat, y_hat.len()).copy_from_slice(y_hat);
             for ((layer, x), gradient) in layers.iter().zip(xs).zip(&mut *in_layers).rev() {
                 let y_hat = &mut tape.y_hat[..y.len()];
-                mask(y_hat, y);
+                relu_mask(y_hat, y);
                 let x_hat = resize(&mut tape.x_hat, rows * layer.inputs());
                 layer.adjoint((rows, x, y_hat), Some(x_hat), gradient, &mut tape.convolution);
                 swap(&mut tape.x_hat, &mut tape.y_hat);
                 y = &x[..rows * layer.inputs()];
             }
             let y_hat = &mut tape.y_hat[..y.len()];
-            mask(y_hat, y);
+            relu_mask(y_hat, y);
             let x = self.entering(inputs, &mut tape.first);
             first.adjoint((rows, x, y_hat), None, in_first, &mut tape.convolution);
         }
@@ -175,7 +175,7 @@ impl<T: Element> Encoder<T> {
         EncoderGradient {
             layers: self.layers.iter().map(Layer::gradient).collect(),
             linear: self.linear.gradient(),
-            norm: self.norm.as_ref().map(Norm::gradient),
+            norm: self.norm.as_ref().map(LayerNorm::gradient),
         }
     }
 
@@ -193,7 +193,7 @@ impl<T: Element> Encoder<T> {
             }
         }
         let LinearGradient { weight, bias } = &gradient.linear;
-        add("linear".to_owned(), [turn(weight, self.linear.inputs / self.channels, self.channels), bias.to_vec()]);
+        add("linear".to_owned(), [transpose(weight, self.linear.inputs / self.channels, self.channels), bias.to_vec()]);
         if let Some(LinearGradient { weight, bias }) = &gradient.norm {
             add("norm".to_owned(), [weight.to_vec(), bias.to_vec()]);
         }
@@ -206,22 +206,22 @@ impl<T: Element> Encoder<T> {
         inputs: &[Observed<'_>],
         features: &mut [T],
         (first, between): (&mut AlignedVec<T>, &mut [AlignedVec<T>]),
-        room: &mut convolution::Room<T>,
+        room: &mut Conv2dWorkspace<T>,
     ) {
         let Some((last, layers)) = self.layers.split_last() else { return self.numbers.write(inputs, features) };
         let mut x = self.entering(inputs, first);
         for (layer, y) in layers.iter().zip(between) {
             let size = inputs.len() * layer.outputs();
-            let y = resize(y, size + BEYOND);
+            let y = resize(y, size + PADDING);
             layer.forward(inputs.len(), x, &mut y[..size], room);
             x = y;
         }
         last.forward(inputs.len(), x, features, room);
     }
 
-    /// What the first layer takes, with [`BEYOND`] numbers behind it.
+    /// What the first layer takes, with [`PADDING`] numbers behind it.
     fn entering<'a>(&self, inputs: &[Observed<'_>], x: &'a mut AlignedVec<T>) -> &'a [T] {
-        let x = resize(x, inputs.len() * self.layers[0].inputs() + BEYOND);
+        let x = resize(x, inputs.len() * self.layers[0].inputs() + PADDING);
         self.numbers.write(inputs, x);
         x
     }
@@ -247,10 +247,10 @@ fn of_images<T: Element>(
     for (i, conv) in config.convolutions.iter().enumerate() {
         let [weight, bias] = ["weight", "bias"].map(|part| weights.get(&format!("encoder.conv.{i}.{part}")));
         let (kernel, stride) = (conv.kernel as usize, conv.stride as usize);
-        layers.push(Layer::Convolution(Convolution::new(
-            (side, channels),
-            (kernel, stride),
-            (&weight, &bias),
+        layers.push(Layer::Convolution(Conv2d::new(
+            Conv2dParams { side, channels, kernel, stride },
+            &weight,
+            &bias,
             precision,
         )));
         (side, channels) = ((side - kernel) / stride + 1, conv.channels as usize);
@@ -294,12 +294,12 @@ impl<T: Element> Layer<T> {
     }
 
     /// Of R = `rows` inputs.
-    fn forward(&self, rows: usize, x: &[T], y: &mut [T], room: &mut convolution::Room<T>) {
+    fn forward(&self, rows: usize, x: &[T], y: &mut [T], room: &mut Conv2dWorkspace<T>) {
         match self {
             Self::Convolution(convolution) => convolution.forward(x, y, room),
             Self::Linear(linear) => {
                 linear.forward(&x[..rows * linear.inputs], y);
-                rectify(y);
+                relu(y);
             }
         }
     }
@@ -310,14 +310,15 @@ impl<T: Element> Layer<T> {
         (rows, x, y_hat): (usize, &[T], &[T]),
         x_hat: Option<&mut [T]>,
         gradient: &mut [LinearGradient<T>],
-        room: &mut convolution::Room<T>,
+        room: &mut Conv2dWorkspace<T>,
     ) {
         match self {
-            Self::Convolution(convolution) => convolution.adjoint((x, y_hat), x_hat, gradient, room),
+            Self::Convolution(convolution) => convolution.vjp(x, y_hat, x_hat, gradient, room),
             Self::Linear(linear) => {
-                linear.accumulate_all(rows, (&x[..rows * linear.inputs], y_hat), &mut gradient[0]);
+                let stacked = Stacked { x: &x[..rows * linear.inputs], y: y_hat };
+                linear.accumulate_all(rows, stacked, &mut gradient[0]);
                 if let Some(x_hat) = x_hat {
-                    linear.backward(y_hat, x_hat);
+                    linear.vjp(y_hat, x_hat);
                 }
             }
         }

@@ -10,40 +10,28 @@
 //! | adjoint | x̂ = ∂Φ/∂x and ∂Φ/∂θ, Φ = ŷᵀy + ȳᵀẏ | the outer gradient, both orders in one pass |
 //!
 //! The last row is what makes this cheap: the adjoint of ẏ is ȳ, which the inner loop has computed already, so that the
-//! second order costs two passes more than the first and nothing is recorded but what the passes leave on a [tape](dense).
+//! second order costs two passes more than the first and nothing is recorded but what the passes leave on a [tape](layers::dense).
 //! The same quantities serve both branches of g_θ, and the policy's rollout is also the first rollout of the inner loop.
 //!
 //! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
 //! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
 //! ([`Embedder`]). Tested against autograd in float64 (`tests/gradients.rs`).
 
-mod attenuated;
-mod convolution;
-mod dense;
 mod descent;
 mod embedder;
 mod encoder;
-mod gate;
-mod gated;
-mod gemm;
+pub(crate) mod gemm;
 mod inner;
-mod linear;
-mod modulation;
+pub(crate) mod layers;
 mod network;
-mod norm;
 mod outer;
 mod planner;
-mod readout;
-mod rectified;
 mod sampling;
-mod simd;
-mod sparse;
-mod tiles;
-mod winograd;
+pub(crate) mod simd;
 
 pub(crate) use descent::Descent;
 pub use embedder::Embedder;
-pub use linear::Weights;
+pub use layers::linear::Weights;
 pub use outer::Samples;
 pub use planner::Planner;
 pub(crate) use sampling::Sampling;
@@ -133,11 +121,6 @@ impl<T: tch::kind::Element + Copy> Weights<T> for Variables<'_> {
     fn get(&self, name: &str) -> Vec<T> {
         floats(&self.0[name])
     }
-}
-
-/// Whether bfloat16 is multiplied faster than float32 here.
-pub(crate) fn bfloat16_is_fast() -> bool {
-    simd::bf16::Bf16x2::is_fast()
 }
 
 /// A tensor's numbers, row by row.

@@ -1,13 +1,14 @@
 //! g_θ: the four passes over one step of a rollout.
 
-use super::attenuated::Scratch;
-use super::dense::{Dense, DenseGradient, Order, Tape};
-use super::linear::Weights;
-use super::rectified::{mask, rectify};
+use crate::config::ModelConfig;
+use crate::engine::layers::dense::{Dense, DenseGradient, LayerTape};
+use crate::engine::layers::linear::Weights;
+use crate::engine::layers::neuromodulated::gated_weights::Scratch;
+use crate::engine::layers::passes::Order;
+use crate::engine::layers::relu::{relu, relu_mask};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
-use crate::config::ModelConfig;
 
 /// The layers of both branches.
 const POLICY: [&str; 2] = ["policy_0", "policy_1"];
@@ -46,9 +47,9 @@ pub struct NetworkGradient<T> {
 /// What the passes over a step leave for each other.
 #[derive(Debug)]
 pub struct Step<T> {
-    trunk: Tape<T>,
-    policy: [Tape<T>; 2],
-    dynamics: Option<[Tape<T>; 2]>,
+    trunk: LayerTape<T>,
+    policy: [LayerTape<T>; 2],
+    dynamics: Option<[LayerTape<T>; 2]>,
     /// The trunk's features `[R, hidden]`.
     features: AlignedVec<T>,
     /// What the policy proposed, `[R, A]`.
@@ -142,7 +143,7 @@ impl<T: Element> Network<T> {
         }
         let features = &mut step.features[..rows * self.sizes.hidden];
         self.trunk.forward(rows, &mut step.trunk, features);
-        rectify(features);
+        relu(features);
     }
 
     /// The policy branch: an action, `[R, A]`, of the features on the tape.
@@ -150,7 +151,7 @@ impl<T: Element> Network<T> {
         let [first, second] = &mut step.policy;
         first.x(rows).copy_from_slice(&step.features[..rows * self.sizes.hidden]);
         self.policy[0].forward(rows, first, second.x(rows));
-        rectify(second.x(rows));
+        relu(second.x(rows));
         self.policy[1].forward(rows, second, action);
         for value in &mut *action {
             *value = value.tanh();
@@ -167,7 +168,7 @@ impl<T: Element> Network<T> {
             input[hidden..].copy_from_slice(&action[r * actions..][..actions]);
         }
         layers[0].forward(rows, first, second.x(rows));
-        rectify(second.x(rows));
+        relu(second.x(rows));
         let change = &mut buffers.narrow[..rows * latent];
         layers[1].forward(rows, second, change);
         add(x, change);
@@ -187,11 +188,11 @@ impl<T: Element> Network<T> {
         let Sizes { latent, hidden, actions, seen } = self.sizes;
         second.y_bar(rows).copy_from_slice(x_bar);
         first.y_bar(rows).fill(T::ZERO);
-        layers[1].backward(rows, second, &mut buffers.gates, first.y_bar(rows));
-        mask(first.y_bar(rows), second.x(rows));
+        layers[1].vjp(rows, second, &mut buffers.gates, first.y_bar(rows));
+        relu_mask(first.y_bar(rows), second.x(rows));
         let wide = &mut buffers.wide[..rows * (hidden + actions)];
         wide.fill(T::ZERO);
-        layers[0].backward(rows, first, &mut buffers.gates, wide);
+        layers[0].vjp(rows, first, &mut buffers.gates, wide);
         let features_bar = step.trunk.y_bar(rows);
         for (r, row) in wide.chunks_exact(hidden + actions).enumerate() {
             features_bar[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
@@ -200,10 +201,10 @@ impl<T: Element> Network<T> {
         if is_first {
             return;
         }
-        mask(features_bar, &step.features);
+        relu_mask(features_bar, &step.features);
         let wide = &mut buffers.wide[..rows * seen];
         wide.fill(T::ZERO);
-        self.trunk.backward(rows, &mut step.trunk, &mut buffers.gates, wide);
+        self.trunk.vjp(rows, &mut step.trunk, &mut buffers.gates, wide);
         for (x_bar, row) in x_bar.chunks_exact_mut(latent).zip(wide.chunks_exact(seen)) {
             add(x_bar, &row[..latent]);
         }
@@ -229,19 +230,19 @@ impl<T: Element> Network<T> {
                 input[..latent].copy_from_slice(x_dot);
                 input[latent..].fill(T::ZERO);
             }
-            self.trunk.tangent(rows, &mut step.trunk, features_dot);
-            mask(features_dot, &step.features);
+            self.trunk.jvp(rows, &mut step.trunk, features_dot);
+            relu_mask(features_dot, &step.features);
         }
         for (r, input) in first.x_dot(rows).chunks_exact_mut(hidden + actions).enumerate() {
             input[..hidden].copy_from_slice(&features_dot[r * hidden..][..hidden]);
             input[hidden..].copy_from_slice(&action_dot[r * actions..][..actions]);
         }
         let hidden_dot = &mut buffers.narrow[..rows * hidden];
-        layers[0].tangent(rows, first, hidden_dot);
-        mask(hidden_dot, second.x(rows));
+        layers[0].jvp(rows, first, hidden_dot);
+        relu_mask(hidden_dot, second.x(rows));
         second.x_dot(rows).copy_from_slice(hidden_dot);
         let change = &mut buffers.narrow[..rows * latent];
-        layers[1].tangent(rows, second, change);
+        layers[1].jvp(rows, second, change);
         add(x_dot, change);
     }
 
@@ -264,11 +265,11 @@ impl<T: Element> Network<T> {
         {
             second.y_hat(rows).copy_from_slice(hat.x);
             first.y_hat(rows).fill(T::ZERO);
-            layers[1].adjoint(rows, order, second, gates, first.y_hat(rows), &mut gradients[1]);
-            mask(first.y_hat(rows), second.x(rows));
+            layers[1].double_backward(rows, order, second, gates, first.y_hat(rows), &mut gradients[1]);
+            relu_mask(first.y_hat(rows), second.x(rows));
             let wide = &mut buffers.wide[..rows * (hidden + actions)];
             wide.fill(T::ZERO);
-            layers[0].adjoint(rows, order, first, gates, wide, &mut gradients[0]);
+            layers[0].double_backward(rows, order, first, gates, wide, &mut gradients[0]);
             for (r, row) in wide.chunks_exact(hidden + actions).enumerate() {
                 features_hat[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
                 add(&mut hat.action[r * actions..][..actions], &row[hidden..]);
@@ -281,15 +282,22 @@ impl<T: Element> Network<T> {
                 *y_hat = *action_hat * (T::ONE - *proposed * *proposed);
             }
             first.y_hat(rows).fill(T::ZERO);
-            self.policy[1].adjoint(rows, Order::First, second, gates, first.y_hat(rows), &mut gradient.policy[1]);
-            mask(first.y_hat(rows), second.x(rows));
-            self.policy[0].adjoint(rows, Order::First, first, gates, features_hat, &mut gradient.policy[0]);
+            self.policy[1].double_backward(
+                rows,
+                Order::First,
+                second,
+                gates,
+                first.y_hat(rows),
+                &mut gradient.policy[1],
+            );
+            relu_mask(first.y_hat(rows), second.x(rows));
+            self.policy[0].double_backward(rows, Order::First, first, gates, features_hat, &mut gradient.policy[0]);
         }
-        mask(features_hat, &step.features);
+        relu_mask(features_hat, &step.features);
         step.trunk.y_hat(rows).copy_from_slice(features_hat);
         let wide = &mut buffers.wide[..rows * seen];
         wide.fill(T::ZERO);
-        self.trunk.adjoint(rows, parts.trunk, &mut step.trunk, gates, wide, &mut gradient.trunk);
+        self.trunk.double_backward(rows, parts.trunk, &mut step.trunk, gates, wide, &mut gradient.trunk);
         let rows_of = hat.x.chunks_exact_mut(latent).zip(hat.x_g.chunks_exact_mut(latent));
         for ((x_hat, x_g_hat), row) in rows_of.zip(wide.chunks_exact(seen)) {
             add(x_hat, &row[..latent]);

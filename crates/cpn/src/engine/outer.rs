@@ -1,10 +1,10 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
-use super::dense::Order;
 use super::inner::{Actions, Purpose, Rollout, clamp};
 use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
-use super::simd::vector;
+use crate::engine::layers::passes::Order;
 use crate::engine::simd::element::Element;
+use crate::engine::simd::vector;
 
 /// What the rows of a batch are about.
 #[derive(Debug, Clone, Copy)]

@@ -4,13 +4,13 @@ use super::Variables;
 use super::descent::Descent;
 use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
-use super::linear::Weights;
 use super::network::{Buffers, Network};
 use super::sampling::Sampling;
-use crate::engine::simd::element::Element;
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
+use crate::engine::layers::linear::Weights;
+use crate::engine::simd::element::Element;
 use crate::method::{Iterations, Method, Observed, Ongoing, Plan, Query, Search, Solver, State};
 use rayon::prelude::*;
 

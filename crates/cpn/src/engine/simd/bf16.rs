@@ -182,7 +182,8 @@ mod tests {
             let Self([a, b], c) = self;
             let count = S::F32_LANES;
             for (c, (a, b)) in c.chunks_mut(count).zip(a.chunks(count).zip(b.chunks(count))) {
-                let sums = Bf16x2::mul_add(simd, Bf16x2::load(simd, a), Bf16x2::load(simd, b), simd.partial_load_f32s(c));
+                let sums =
+                    Bf16x2::mul_add(simd, Bf16x2::load(simd, a), Bf16x2::load(simd, b), simd.partial_load_f32s(c));
                 simd.partial_store_f32s(c, sums);
             }
         }

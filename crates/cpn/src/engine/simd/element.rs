@@ -40,11 +40,7 @@ pub trait Operand: Copy + Debug + Default + PartialEq + Send + Sync + 'static {
     /// Packing along rows: `[R, N]` as `[R, N / PACK]`, in `workspace` if a conversion is needed.
     fn pack_along_k<'a>(numbers: &'a [Self::Sum], workspace: &'a mut AlignedVec<Self>) -> &'a [Self];
     /// Packing across rows: `[R, columns]` as `[R / PACK, columns]`, with zeros below an odd last row.
-    fn pack_row_pairs<'a>(
-        numbers: &'a [Self::Sum],
-        columns: usize,
-        workspace: &'a mut AlignedVec<Self>,
-    ) -> &'a [Self];
+    fn pack_row_pairs<'a>(numbers: &'a [Self::Sum], columns: usize, workspace: &'a mut AlignedVec<Self>) -> &'a [Self];
 }
 
 /// A floating-point number, and registers full of it.
