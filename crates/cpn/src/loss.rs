@@ -2,7 +2,8 @@
 
 use crate::agent::Agent;
 use crate::encoder::Precision;
-use crate::engine::{self, Embedder, OuterLoop, Samples, Variables, floats};
+use crate::engine::networks::variables::{Variables, floats};
+use crate::engine::{self, Embedder, OuterLoop, Samples};
 use crate::method::Frames;
 use std::collections::BTreeMap;
 use std::time::Instant;

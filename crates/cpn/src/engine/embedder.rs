@@ -1,9 +1,9 @@
 //! The encoder in training: forward over the frames of a batch, and back to its weights.
 
-use super::encoder::{Encoder, EncoderGradient, INPUTS, Tape};
 use crate::config::EncoderConfig;
 use crate::encoder::Precision;
 use crate::engine::layers::linear::Weights;
+use crate::engine::networks::encoder::{Encoder, EncoderGradient, EncoderTape, GROUP};
 use crate::engine::simd::element::Element;
 use crate::method::Observed;
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ pub struct Embedder<T: Element> {
     precision: Precision,
     /// By the weights of the last forward pass.
     encoder: Option<Encoder<T>>,
-    tapes: Vec<Tape<T>>,
+    tapes: Vec<EncoderTape<T>>,
 }
 
 /// Frames that are embedded, until it is known what a loss changes by with their embeddings.
@@ -25,13 +25,13 @@ pub struct Embedded<'a, T: Element> {
     frames: Vec<Observed<'a>>,
     /// Frames of a thread.
     share: usize,
-    tapes: &'a mut [Tape<T>],
+    tapes: &'a mut [EncoderTape<T>],
 }
 
 impl<T: Element> Embedder<T> {
     /// For encoders of a valid configuration, on `threads` threads, at least one.
     pub fn new(config: EncoderConfig, precision: Precision, threads: usize) -> Self {
-        Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| Tape::new()).collect() }
+        Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| EncoderTape::new()).collect() }
     }
 
     /// Embeds frames, by what the weights are now, as `[F, Z]`.
@@ -41,7 +41,7 @@ impl<T: Element> Embedder<T> {
         frames: Vec<Observed<'a>>,
     ) -> (Vec<T>, Embedded<'a, T>) {
         let encoder = &*self.encoder.insert(Encoder::new(&self.config, self.precision, weights));
-        let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(INPUTS);
+        let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(GROUP);
         let parts = self.tapes.par_iter_mut().zip(frames.par_chunks(share));
         let embeddings: Vec<_> = parts.map(|(tape, frames)| encoder.forward(frames, true, tape)).collect();
         (embeddings.concat(), Embedded { encoder, frames, share, tapes: &mut self.tapes })
@@ -58,7 +58,7 @@ impl<T: Element> Embedded<'_, T> {
         let gradients: Vec<EncoderGradient<T>> = parts
             .map(|((tape, frames), x_hat)| {
                 let mut gradient = encoder.gradient();
-                encoder.adjoint(frames, x_hat.to_vec(), &mut gradient, tape);
+                encoder.vjp(frames, x_hat.to_vec(), &mut gradient, tape);
                 gradient
             })
             .collect();

@@ -1,13 +1,13 @@
 //! The inner loop: a rollout of g_θ, how far from the goal it ends, and the gradient of that in its actions.
 
-use super::network::{Buffers, Network, Step};
+use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics, StepTape};
 use crate::engine::simd::element::Element;
 
 /// A rollout over a block of R samples.
 #[derive(Debug)]
 pub struct Rollout<T> {
     /// One for each of the H steps.
-    pub steps: Vec<Step<T>>,
+    pub steps: Vec<StepTape<T>>,
     /// x_H - x_g, `[R, Z]`.
     pub miss: Vec<T>,
     /// The inner loss' gradient in the actions, `[H, R, A]`.
@@ -38,9 +38,9 @@ pub enum Purpose {
 
 impl<T: Element> Rollout<T> {
     /// Room for H = `horizon` steps of blocks of up to `rows` samples.
-    pub fn new(network: &Network<T>, rows: usize, horizon: usize) -> Self {
+    pub fn new(network: &PolicyDynamics<T>, rows: usize, horizon: usize) -> Self {
         Self {
-            steps: (0..horizon).map(|_| network.step(rows)).collect(),
+            steps: (0..horizon).map(|_| network.tape(rows)).collect(),
             miss: vec![T::ZERO; rows * network.sizes.latent],
             gradient: vec![T::ZERO; horizon * rows * network.sizes.actions],
         }
@@ -50,7 +50,7 @@ impl<T: Element> Rollout<T> {
     /// there.
     pub fn forward(
         &mut self,
-        network: &Network<T>,
+        network: &PolicyDynamics<T>,
         (x, x_g): (&mut [T], &[T]),
         (source, actions): (Actions, &mut [T]),
         purpose: Purpose,
@@ -77,19 +77,19 @@ impl<T: Element> Rollout<T> {
 
     /// Leaves the gradient in the actions of the Huber loss (δ = 1) between x_H and x_g. `x_bar`, `[R, Z]`, is room for
     /// the adjoints of the states.
-    pub fn backward(&mut self, network: &Network<T>, x_bar: &mut [T], buffers: &mut Buffers<T>) {
+    pub fn backward(&mut self, network: &PolicyDynamics<T>, x_bar: &mut [T], buffers: &mut Buffers<T>) {
         let rows = x_bar.len() / network.sizes.latent;
         for (x_bar, miss) in x_bar.iter_mut().zip(&self.miss) {
             *x_bar = clamp(*miss);
         }
         let gradients = self.gradient.chunks_mut(rows * network.sizes.actions);
         for (t, (step, gradient)) in self.steps.iter_mut().zip(gradients).enumerate().rev() {
-            network.backward(rows, t == 0, step, x_bar, gradient, buffers);
+            network.vjp(rows, t == 0, step, x_bar, gradient, buffers);
         }
     }
 
     /// The inner loss of each of the R samples, summed over the latent.
-    pub fn losses(&self, network: &Network<T>, rows: usize) -> impl Iterator<Item = T> {
+    pub fn losses(&self, network: &PolicyDynamics<T>, rows: usize) -> impl Iterator<Item = T> {
         let half = T::ONE / (T::ONE + T::ONE);
         self.miss.chunks_exact(network.sizes.latent).take(rows).map(move |miss| {
             // |m| - 1/2 beyond 1, m²/2 within.

@@ -19,11 +19,10 @@
 
 mod descent;
 mod embedder;
-mod encoder;
 pub(crate) mod gemm;
 mod inner;
 pub(crate) mod layers;
-mod network;
+pub(crate) mod networks;
 mod outer;
 mod planner;
 mod sampling;
@@ -39,11 +38,9 @@ pub use simd::element::Element;
 pub use simd::vector::add;
 
 use crate::config::ModelConfig;
-use network::Network;
+use networks::policy_dynamics::PolicyDynamics;
 use outer::{Settings, Sums, Workspace};
 use rayon::prelude::*;
-use std::collections::HashMap;
-use tch::Tensor;
 
 /// R, the samples of a block in training: more, and weights are read less often; fewer, and what the passes leave stays nearer.
 const BLOCK: usize = 32;
@@ -84,7 +81,7 @@ impl<T: Element> OuterLoop<T> {
 
     /// The outer loss of a batch. The order of its sums depends on nothing but the batch and the number of threads.
     pub fn run(&mut self, weights: &impl Weights<T>, samples: Samples<'_, T>) -> OuterGradient<T> {
-        let network = Network::new(&self.config, weights);
+        let network = PolicyDynamics::new(&self.config, weights);
         let (horizon, updates) = (self.config.horizon as usize, self.config.updates as usize);
         let known: T = samples.mask.iter().copied().sum();
         let settings = Settings {
@@ -112,18 +109,4 @@ impl<T: Element> OuterLoop<T> {
         parts.for_each(|part| sums.add(&part));
         OuterGradient { loss: sums.loss, x, x_g, weights: sums.in_weights(&network, updates > 0) }
     }
-}
-
-/// An agent's weights.
-pub(crate) struct Variables<'a>(pub &'a HashMap<String, Tensor>);
-
-impl<T: tch::kind::Element + Copy> Weights<T> for Variables<'_> {
-    fn get(&self, name: &str) -> Vec<T> {
-        floats(&self.0[name])
-    }
-}
-
-/// A tensor's numbers, row by row.
-pub(crate) fn floats<T: tch::kind::Element + Copy>(tensor: &Tensor) -> Vec<T> {
-    Vec::try_from(tensor.flatten(0, -1)).expect("a tensor of the kind that was asked for")
 }

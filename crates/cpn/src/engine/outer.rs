@@ -1,10 +1,12 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
 use super::inner::{Actions, Purpose, Rollout, clamp};
-use super::network::{Buffers, Hat, Network, NetworkGradient, Parts, Sizes};
+use super::simd::vector;
 use crate::engine::layers::passes::Order;
+use crate::engine::networks::policy_dynamics::{
+    Branches, Buffers, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
+};
 use crate::engine::simd::element::Element;
-use crate::engine::simd::vector;
 
 /// What the rows of a batch are about.
 #[derive(Debug, Clone, Copy)]
@@ -40,7 +42,7 @@ pub struct Sums<T> {
     /// Its gradient in α.
     pub step_size: T,
     /// And in g_θ.
-    pub network: NetworkGradient<T>,
+    pub network: PolicyDynamicsGradient<T>,
 }
 
 /// Tapes for a block of rows.
@@ -78,7 +80,7 @@ impl<'a, T: Element> Samples<'a, T> {
 
 impl<T: Element> Sums<T> {
     /// Sums of nothing.
-    pub fn zeros(network: &Network<T>) -> Self {
+    pub fn zeros(network: &PolicyDynamics<T>) -> Self {
         Self { loss: T::ZERO, step_size: T::ZERO, network: network.gradient() }
     }
 
@@ -90,7 +92,7 @@ impl<T: Element> Sums<T> {
     }
 
     /// The gradient by the names of the weights, that in α if it takes part.
-    pub fn in_weights(&self, network: &Network<T>, with_step_size: bool) -> Vec<(String, Vec<T>)> {
+    pub fn in_weights(&self, network: &PolicyDynamics<T>, with_step_size: bool) -> Vec<(String, Vec<T>)> {
         let weights = network.in_weights(&self.network).into_iter();
         let mut weights: Vec<_> = weights.map(|(name, weight)| (format!("network.{name}"), weight)).collect();
         if with_step_size {
@@ -102,7 +104,7 @@ impl<T: Element> Sums<T> {
 
 impl<T: Element> Workspace<T> {
     /// Room for blocks of up to `rows` samples.
-    pub fn new(network: &Network<T>, rows: usize, horizon: usize, updates: usize) -> Self {
+    pub fn new(network: &PolicyDynamics<T>, rows: usize, horizon: usize, updates: usize) -> Self {
         let Sizes { latent, actions, .. } = network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; rows * columns];
         Self {
@@ -120,7 +122,7 @@ impl<T: Element> Workspace<T> {
     /// writes x̂ and x̂_g, the loss' gradients in x and x_g, `[R, Z]`.
     pub fn run(
         &mut self,
-        network: &Network<T>,
+        network: &PolicyDynamics<T>,
         settings: Settings<T>,
         samples: Samples<'_, T>,
         (x_hat, x_g_hat): (&mut [T], &mut [T]),
@@ -149,7 +151,7 @@ impl<T: Element> Workspace<T> {
     }
 
     /// Rollout k: along the policy's actions if it is the first, along the plan's otherwise.
-    fn roll_out(&mut self, network: &Network<T>, settings: Settings<T>, samples: Samples<'_, T>, k: usize) {
+    fn roll_out(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, samples: Samples<'_, T>, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
         let x = &mut x[..samples.x.len()];
         x.copy_from_slice(samples.x);
@@ -159,7 +161,7 @@ impl<T: Element> Workspace<T> {
     }
 
     /// Update k of the actions: a step down the inner loss, by its gradient in the actions.
-    fn update(&mut self, network: &Network<T>, settings: Settings<T>, rows: usize, k: usize) {
+    fn update(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, rows: usize, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
         rollouts[k].backward(network, &mut x[..rows * network.sizes.latent], buffers);
         let size = settings.horizon * rows * network.sizes.actions;
@@ -193,7 +195,14 @@ impl<T: Element> Workspace<T> {
 
     /// Through update k, a ← a - α ∂L/∂a: the loss' derivative in ∂L/∂a is ȧ = -α â, and its derivative in whatever ∂L/∂a
     /// depends on is that of L's tangent along ȧ, whose passes begin here and end in [`Self::adjoints`].
-    fn tangents(&mut self, network: &Network<T>, settings: Settings<T>, rows: usize, k: usize, x_g_hat: &mut [T]) {
+    fn tangents(
+        &mut self,
+        network: &PolicyDynamics<T>,
+        settings: Settings<T>,
+        rows: usize,
+        k: usize,
+        x_g_hat: &mut [T],
+    ) {
         let Self { rollouts, buffers, actions_hat, actions_dot, x, x_hat, .. } = self;
         let Rollout { steps, miss, .. } = &mut rollouts[k];
         for (dot, hat) in actions_dot.iter_mut().zip(&*actions_hat) {
@@ -203,7 +212,7 @@ impl<T: Element> Workspace<T> {
         let x_dot = &mut x[..latents];
         x_dot.fill(T::ZERO);
         for (t, step) in steps.iter_mut().enumerate() {
-            network.tangent(rows, t == 0, step, &actions_dot[t * size..][..size], x_dot, buffers);
+            network.jvp(rows, t == 0, step, &actions_dot[t * size..][..size], x_dot, buffers);
         }
         // Where the Huber loss is quadratic.
         for (((x_hat, x_g_hat), x_dot), miss) in x_hat.iter_mut().zip(x_g_hat).zip(x_dot).zip(miss) {
@@ -215,29 +224,29 @@ impl<T: Element> Workspace<T> {
     /// Back along rollout k: from x̂_H to x̂_0, and to â before the update.
     fn adjoints(
         &mut self,
-        network: &Network<T>,
+        network: &PolicyDynamics<T>,
         settings: Settings<T>,
         rows: usize,
         k: usize,
         x_g_hat: &mut [T],
-        gradient: &mut NetworkGradient<T>,
+        gradient: &mut PolicyDynamicsGradient<T>,
     ) {
         let Self { rollouts, buffers, actions_hat, x_hat, .. } = self;
         let size = rows * network.sizes.actions;
         let order = if settings.updates > 0 { Order::Second } else { Order::First };
         for (t, step) in rollouts[k].steps.iter_mut().enumerate().rev() {
-            let parts = Parts {
+            let branches = Branches {
                 // The first step's x does not move with the actions.
                 trunk: if t > 0 { order } else { Order::First },
                 dynamics: settings.moves(t).then_some(order),
                 policy: k == 0,
             };
-            let mut hat = Hat {
+            let mut hat = Cotangents {
                 x: &mut x_hat[..rows * network.sizes.latent],
                 x_g: x_g_hat,
                 action: &mut actions_hat[t * size..][..size],
             };
-            network.adjoint(rows, parts, step, &mut hat, gradient, buffers);
+            network.double_backward(rows, branches, step, &mut hat, gradient, buffers);
         }
     }
 }

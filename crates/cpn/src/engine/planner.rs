@@ -1,15 +1,15 @@
 //! Plans without a graph, in memory that is kept from plan to plan.
 
-use super::Variables;
 use super::descent::Descent;
-use super::encoder::{Encoder, Tape};
 use super::inner::{Actions, Purpose, Rollout};
-use super::network::{Buffers, Network};
 use super::sampling::Sampling;
 use crate::agent::Agent;
 use crate::config::{Input, ModelConfig};
 use crate::encoder::Precision;
 use crate::engine::layers::linear::Weights;
+use crate::engine::networks::encoder::{Encoder, EncoderTape};
+use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics};
+use crate::engine::networks::variables::Variables;
 use crate::engine::simd::element::Element;
 use crate::method::{Iterations, Method, Observed, Ongoing, Plan, Query, Search, Solver, State};
 use rayon::prelude::*;
@@ -30,7 +30,7 @@ pub struct Planner {
 /// g_θ with what its inner loop needs.
 #[derive(Debug)]
 pub(super) struct Dynamics<T> {
-    pub(super) network: Network<T>,
+    pub(super) network: PolicyDynamics<T>,
     /// α.
     pub(super) step_size: T,
     /// H.
@@ -42,7 +42,7 @@ pub(super) struct Dynamics<T> {
 /// One thread's memory.
 #[derive(Debug)]
 pub(super) struct Worker<T: Element> {
-    tape: Tape<T>,
+    tape: EncoderTape<T>,
     pub(super) rollout: Rollout<T>,
     pub(super) buffers: Buffers<T>,
     /// x along a rollout, then x̄, `[R, Z]`.
@@ -70,7 +70,7 @@ impl Planner {
 impl<T: Element> Dynamics<T> {
     fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
         Self {
-            network: Network::new(config, weights),
+            network: PolicyDynamics::new(config, weights),
             step_size: weights.get("step_size")[0],
             horizon: config.horizon as usize,
             plans: config.method.plans(),
@@ -83,7 +83,7 @@ impl<T: Element> Worker<T> {
         let sizes = dynamics.network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];
         Self {
-            tape: Tape::new(),
+            tape: EncoderTape::new(),
             rollout: Rollout::new(&dynamics.network, BLOCK, dynamics.horizon),
             buffers: dynamics.network.buffers(BLOCK),
             x: zeros(sizes.latent),

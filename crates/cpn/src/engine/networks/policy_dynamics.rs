@@ -1,4 +1,4 @@
-//! g_θ: the four passes over one step of a rollout.
+//! The combined policy and dynamics g_θ: the four passes over one step of a rollout.
 
 use crate::config::ModelConfig;
 use crate::engine::layers::dense::{Dense, DenseGradient, LayerTape};
@@ -10,74 +10,74 @@ use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
 
-/// The layers of both branches.
+/// Names of the layers of both branches.
 const POLICY: [&str; 2] = ["policy_0", "policy_1"];
 const DYNAMICS: [&str; 2] = ["dynamics_0", "dynamics_1"];
 
-/// The network's weights.
+/// Weights of g_θ: a trunk, and the branches for the action and for the next state.
 #[derive(Debug)]
-pub struct Network<T> {
+pub struct PolicyDynamics<T> {
     trunk: Dense<T>,
     policy: [Dense<T>; 2],
     dynamics: Option<[Dense<T>; 2]>,
     pub sizes: Sizes,
 }
 
-/// How wide everything is.
+/// Widths of the network.
 #[derive(Debug, Clone, Copy)]
 pub struct Sizes {
     /// Z.
     pub latent: usize,
-    /// Of the trunk's features and the hidden layers.
+    /// Width of the trunk's features and of the hidden layers.
     pub hidden: usize,
     /// A.
     pub actions: usize,
-    /// What the trunk sees: x, and x_g if it is conditioned on the goal.
+    /// Width of the trunk's inputs: x, and x_g if it is conditioned on the goal.
     pub seen: usize,
 }
 
-/// What a loss changes by when the network's weights do.
+/// Gradient of a loss in the network's weights.
 #[derive(Debug)]
-pub struct NetworkGradient<T> {
+pub struct PolicyDynamicsGradient<T> {
     pub trunk: DenseGradient<T>,
     pub policy: [DenseGradient<T>; 2],
     pub dynamics: Option<[DenseGradient<T>; 2]>,
 }
 
-/// What the passes over a step leave for each other.
+/// Tape of a step: intermediates that its passes leave for each other.
 #[derive(Debug)]
-pub struct Step<T> {
+pub struct StepTape<T> {
     trunk: LayerTape<T>,
     policy: [LayerTape<T>; 2],
     dynamics: Option<[LayerTape<T>; 2]>,
     /// The trunk's features `[R, hidden]`.
     features: AlignedVec<T>,
-    /// What the policy proposed, `[R, A]`.
+    /// The policy's proposed action, `[R, A]`.
     proposed: AlignedVec<T>,
 }
 
-/// Room that no pass needs beyond its end.
+/// Buffers that no pass needs beyond its end.
 #[derive(Debug)]
 pub struct Buffers<T> {
     gates: Scratch<T>,
-    /// Features with the action, or what the trunk sees.
+    /// Features with the action, or the trunk's inputs.
     wide: AlignedVec<T>,
     narrow: AlignedVec<T>,
 }
 
-impl<T: Element> Network<T> {
-    /// Reads the weights of a model of this configuration.
+impl<T: Element> PolicyDynamics<T> {
+    /// The network of a valid configuration.
     pub fn new(config: &ModelConfig, weights: &impl Weights<T>) -> Self {
         let method = config.method;
         let (latent, hidden) = (config.encoder.latent() as usize, config.hidden as usize);
         let layer = |name: &str, rectified| {
             Dense::named(&format!("network.{name}"), rectified, weights, method.is_neuromodulated())
         };
-        let behind = |name: &str| layer(name, hidden);
+        let after_relu = |name: &str| layer(name, hidden);
         Self {
             trunk: layer("trunk", 0),
-            policy: POLICY.map(behind),
-            dynamics: method.plans().then(|| DYNAMICS.map(behind)),
+            policy: POLICY.map(after_relu),
+            dynamics: method.plans().then(|| DYNAMICS.map(after_relu)),
             sizes: Sizes {
                 latent,
                 hidden,
@@ -88,8 +88,8 @@ impl<T: Element> Network<T> {
     }
 
     /// A gradient of zeros.
-    pub fn gradient(&self) -> NetworkGradient<T> {
-        NetworkGradient {
+    pub fn gradient(&self) -> PolicyDynamicsGradient<T> {
+        PolicyDynamicsGradient {
             trunk: self.trunk.gradient(),
             policy: self.policy.each_ref().map(Dense::gradient),
             dynamics: self.dynamics.as_ref().map(|layers| layers.each_ref().map(Dense::gradient)),
@@ -97,7 +97,7 @@ impl<T: Element> Network<T> {
     }
 
     /// A gradient by the names of the weights, without `network.` before them.
-    pub fn in_weights(&self, gradient: &NetworkGradient<T>) -> Vec<(String, Vec<T>)> {
+    pub fn in_weights(&self, gradient: &PolicyDynamicsGradient<T>) -> Vec<(String, Vec<T>)> {
         let mut weights = self.trunk.in_weights("trunk", &gradient.trunk);
         for ((name, layer), gradient) in POLICY.iter().zip(&self.policy).zip(&gradient.policy) {
             weights.extend(layer.in_weights(name, gradient));
@@ -110,9 +110,9 @@ impl<T: Element> Network<T> {
     }
 
     /// A step's tape for blocks of up to R = `rows` samples.
-    pub fn step(&self, rows: usize) -> Step<T> {
+    pub fn tape(&self, rows: usize) -> StepTape<T> {
         let tapes = |layers: &[Dense<T>; 2]| layers.each_ref().map(|layer| layer.tape(rows));
-        Step {
+        StepTape {
             trunk: self.trunk.tape(rows),
             policy: tapes(&self.policy),
             dynamics: self.dynamics.as_ref().map(tapes),
@@ -121,7 +121,7 @@ impl<T: Element> Network<T> {
         }
     }
 
-    /// Room for blocks of up to `rows` samples.
+    /// Buffers for blocks of up to R = `rows` samples.
     pub fn buffers(&self, rows: usize) -> Buffers<T> {
         let Sizes { latent, hidden, actions, seen } = self.sizes;
         Buffers {
@@ -131,8 +131,8 @@ impl<T: Element> Network<T> {
         }
     }
 
-    /// The trunk: leaves the features of x, `[R, Z]`, on the tape; x_g likewise.
-    pub fn features(&self, rows: usize, step: &mut Step<T>, x: &[T], x_g: &[T]) {
+    /// The trunk: features of x and x_g, `[R, Z]`, left on the tape.
+    pub fn features(&self, rows: usize, step: &mut StepTape<T>, x: &[T], x_g: &[T]) {
         let Sizes { latent, seen, .. } = self.sizes;
         for (r, input) in step.trunk.x(rows).chunks_exact_mut(seen).enumerate() {
             let row = r * latent..(r + 1) * latent;
@@ -146,8 +146,8 @@ impl<T: Element> Network<T> {
         relu(features);
     }
 
-    /// The policy branch: an action, `[R, A]`, of the features on the tape.
-    pub fn policy(&self, rows: usize, step: &mut Step<T>, action: &mut [T]) {
+    /// The policy branch: an action, `[R, A]`, from the features on the tape.
+    pub fn policy(&self, rows: usize, step: &mut StepTape<T>, action: &mut [T]) {
         let [first, second] = &mut step.policy;
         first.x(rows).copy_from_slice(&step.features[..rows * self.sizes.hidden]);
         self.policy[0].forward(rows, first, second.x(rows));
@@ -159,8 +159,8 @@ impl<T: Element> Network<T> {
         step.proposed[..action.len()].copy_from_slice(action);
     }
 
-    /// The dynamics branch: moves x, `[R, Z]`, on by an action, `[R, A]`, with the features on the tape.
-    pub fn next(&self, rows: usize, step: &mut Step<T>, action: &[T], x: &mut [T], buffers: &mut Buffers<T>) {
+    /// The dynamics branch: the next state in place of x, `[R, Z]`, by an action, `[R, A]`, and the features on the tape.
+    pub fn next(&self, rows: usize, step: &mut StepTape<T>, action: &[T], x: &mut [T], buffers: &mut Buffers<T>) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
         let Sizes { latent, hidden, actions, .. } = self.sizes;
         for (r, input) in first.x(rows).chunks_exact_mut(hidden + actions).enumerate() {
@@ -174,18 +174,21 @@ impl<T: Element> Network<T> {
         add(x, change);
     }
 
-    /// Turns x̄ after the step, `[R, Z]`, into x̄ before it, unless `is_first`, and answers ā, `[R, A]`.
-    pub fn backward(
+    /// The gradient in state and action: from x̄ after the step, `[R, Z]`, to x̄ before it, in place, unless `is_first`, and to ā,
+    /// `[R, A]`.
+    pub fn vjp(
         &self,
         rows: usize,
         is_first: bool,
-        step: &mut Step<T>,
+        step: &mut StepTape<T>,
         x_bar: &mut [T],
         action_bar: &mut [T],
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
         let Sizes { latent, hidden, actions, seen } = self.sizes;
+
+        // The dynamics branch, to features and action.
         second.y_bar(rows).copy_from_slice(x_bar);
         first.y_bar(rows).fill(T::ZERO);
         layers[1].vjp(rows, second, &mut buffers.gates, first.y_bar(rows));
@@ -201,6 +204,8 @@ impl<T: Element> Network<T> {
         if is_first {
             return;
         }
+
+        // The trunk, to the state.
         relu_mask(features_bar, &step.features);
         let wide = &mut buffers.wide[..rows * seen];
         wide.fill(T::ZERO);
@@ -210,18 +215,20 @@ impl<T: Element> Network<T> {
         }
     }
 
-    /// Moves ẋ, `[R, Z]`, on by ȧ, `[R, A]`. At the first step ẋ is 0.
-    pub fn tangent(
+    /// The tangent of the next state, in place of ẋ, `[R, Z]`, by ȧ, `[R, A]`. At the first step ẋ is 0.
+    pub fn jvp(
         &self,
         rows: usize,
         is_first: bool,
-        step: &mut Step<T>,
+        step: &mut StepTape<T>,
         action_dot: &[T],
         x_dot: &mut [T],
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
         let Sizes { latent, hidden, actions, seen } = self.sizes;
+
+        // The trunk.
         let features_dot = &mut buffers.narrow[..rows * hidden];
         if is_first {
             features_dot.fill(T::ZERO);
@@ -233,6 +240,8 @@ impl<T: Element> Network<T> {
             self.trunk.jvp(rows, &mut step.trunk, features_dot);
             relu_mask(features_dot, &step.features);
         }
+
+        // The dynamics branch.
         for (r, input) in first.x_dot(rows).chunks_exact_mut(hidden + actions).enumerate() {
             input[..hidden].copy_from_slice(&features_dot[r * hidden..][..hidden]);
             input[hidden..].copy_from_slice(&action_dot[r * actions..][..actions]);
@@ -246,22 +255,25 @@ impl<T: Element> Network<T> {
         add(x_dot, change);
     }
 
-    /// Turns x̂ after the step, `[R, Z]`, into x̂ before it; adds to x̂_g, to â, `[R, A]`, and to the gradient.
-    pub fn adjoint(
+    /// The gradient of Φ: from x̂ after the step, `[R, Z]`, to x̂ before it, in place; adds to x̂_g, to â, `[R, A]`, and to the
+    /// weights' gradient.
+    pub fn double_backward(
         &self,
         rows: usize,
-        parts: Parts,
-        step: &mut Step<T>,
-        hat: &mut Hat<'_, T>,
-        gradient: &mut NetworkGradient<T>,
+        branches: Branches,
+        step: &mut StepTape<T>,
+        hat: &mut Cotangents<'_, T>,
+        gradient: &mut PolicyDynamicsGradient<T>,
         buffers: &mut Buffers<T>,
     ) {
         let Sizes { latent, hidden, actions, seen } = self.sizes;
         let features_hat = &mut buffers.narrow[..rows * hidden];
         features_hat.fill(T::ZERO);
         let gates = &mut buffers.gates;
+
+        // The dynamics branch, to features and action.
         if let (Some(order), Some(layers), Some([first, second]), Some(gradients)) =
-            (parts.dynamics, &self.dynamics, &mut step.dynamics, &mut gradient.dynamics)
+            (branches.dynamics, &self.dynamics, &mut step.dynamics, &mut gradient.dynamics)
         {
             second.y_hat(rows).copy_from_slice(hat.x);
             first.y_hat(rows).fill(T::ZERO);
@@ -275,7 +287,9 @@ impl<T: Element> Network<T> {
                 add(&mut hat.action[r * actions..][..actions], &row[hidden..]);
             }
         }
-        if parts.policy {
+
+        // The policy branch, to the features.
+        if branches.policy {
             let [first, second] = &mut step.policy;
             let proposed = step.proposed.iter().zip(&*hat.action);
             for (y_hat, (proposed, action_hat)) in second.y_hat(rows).iter_mut().zip(proposed) {
@@ -293,11 +307,13 @@ impl<T: Element> Network<T> {
             relu_mask(first.y_hat(rows), second.x(rows));
             self.policy[0].double_backward(rows, Order::First, first, gates, features_hat, &mut gradient.policy[0]);
         }
+
+        // The trunk, to the state and the goal.
         relu_mask(features_hat, &step.features);
         step.trunk.y_hat(rows).copy_from_slice(features_hat);
         let wide = &mut buffers.wide[..rows * seen];
         wide.fill(T::ZERO);
-        self.trunk.double_backward(rows, parts.trunk, &mut step.trunk, gates, wide, &mut gradient.trunk);
+        self.trunk.double_backward(rows, branches.trunk, &mut step.trunk, gates, wide, &mut gradient.trunk);
         let rows_of = hat.x.chunks_exact_mut(latent).zip(hat.x_g.chunks_exact_mut(latent));
         for ((x_hat, x_g_hat), row) in rows_of.zip(wide.chunks_exact(seen)) {
             add(x_hat, &row[..latent]);
@@ -306,8 +322,8 @@ impl<T: Element> Network<T> {
     }
 }
 
-impl<T: Element> NetworkGradient<T> {
-    /// Adds another.
+impl<T: Element> PolicyDynamicsGradient<T> {
+    /// `self += other`.
     pub fn add(&mut self, other: &Self) {
         let ours = [&mut self.trunk].into_iter().chain(&mut self.policy).chain(self.dynamics.iter_mut().flatten());
         let others = [&other.trunk].into_iter().chain(&other.policy).chain(other.dynamics.iter().flatten());
@@ -315,17 +331,19 @@ impl<T: Element> NetworkGradient<T> {
     }
 }
 
-/// Which parts of a step the outer loop differentiates through, and how often.
+/// Branches of a step that the outer loop differentiates through, and the order of each.
 #[derive(Debug, Clone, Copy)]
-pub struct Parts {
+pub struct Branches {
     pub trunk: Order,
+    /// None if nothing depends on the next state.
     pub dynamics: Option<Order>,
+    /// True if the policy proposed the action; its order is the first.
     pub policy: bool,
 }
 
-/// Adjoints that go through a step.
+/// Gradients of Φ that a step takes from its end to its beginning.
 #[derive(Debug)]
-pub struct Hat<'a, T> {
+pub struct Cotangents<'a, T> {
     /// x̂ `[R, Z]`.
     pub x: &'a mut [T],
     /// x̂_g `[R, Z]`.
