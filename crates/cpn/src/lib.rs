@@ -32,9 +32,11 @@ pub mod inner_loop;
 pub mod loss;
 pub mod method;
 pub mod neuromodulated;
+mod observation;
 pub mod positions;
 mod precision;
 pub mod recipe;
+mod search;
 mod unique;
 
 pub use agent::Agent;

@@ -4,7 +4,7 @@ use crate::agent::Agent;
 use crate::encoder::Precision;
 use crate::engine::networks::variables::{Variables, floats};
 use crate::engine::{self, Embedder, OuterLoop, Samples};
-use crate::method::Frames;
+use crate::observation::Frames;
 use std::collections::BTreeMap;
 use std::time::Instant;
 use tch::{Kind, Tensor};

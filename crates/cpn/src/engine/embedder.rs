@@ -1,11 +1,11 @@
 //! The encoder in training: forward over the frames of a batch, and back to its weights.
 
 use crate::config::EncoderConfig;
-use crate::encoder::Precision;
 use crate::engine::layers::linear::Weights;
 use crate::engine::networks::encoder::{Encoder, EncoderGradient, EncoderTape, GROUP};
 use crate::engine::simd::element::Element;
-use crate::method::Observed;
+use crate::observation::Observed;
+use crate::precision::Precision;
 use rayon::prelude::*;
 
 /// Embeds frames and leads gradients back, on some threads, whose tapes are kept from batch to batch.

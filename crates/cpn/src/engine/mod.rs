@@ -17,23 +17,18 @@
 //! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
 //! ([`Embedder`]). Tested against autograd in float64 (`tests/gradients.rs`).
 
-mod descent;
 mod embedder;
 pub(crate) mod gemm;
-mod inner;
 pub(crate) mod layers;
 pub(crate) mod networks;
 mod outer;
-mod planner;
-mod sampling;
+pub(crate) mod planning;
 pub(crate) mod simd;
 
-pub(crate) use descent::Descent;
 pub use embedder::Embedder;
 pub use layers::linear::Weights;
 pub use outer::Samples;
-pub use planner::Planner;
-pub(crate) use sampling::Sampling;
+pub use planning::planner::Planner;
 pub use simd::element::Element;
 pub use simd::vector::add;
 

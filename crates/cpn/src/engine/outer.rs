@@ -1,11 +1,11 @@
 //! The outer loop: behaviour cloning through the inner loop, and its gradient.
 
-use super::inner::{Actions, Purpose, Rollout, clamp};
 use super::simd::vector;
 use crate::engine::layers::passes::Order;
 use crate::engine::networks::policy_dynamics::{
     Branches, Buffers, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
 };
+use crate::engine::planning::rollout::{Actions, Purpose, Rollout, huber_grad};
 use crate::engine::simd::element::Element;
 
 /// What the rows of a batch are about.
@@ -163,7 +163,7 @@ impl<T: Element> Workspace<T> {
     /// Update k of the actions: a step down the inner loss, by its gradient in the actions.
     fn update(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, rows: usize, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
-        rollouts[k].backward(network, &mut x[..rows * network.sizes.latent], buffers);
+        rollouts[k].vjp(network, &mut x[..rows * network.sizes.latent], buffers);
         let size = settings.horizon * rows * network.sizes.actions;
         for (action, gradient) in actions.iter_mut().zip(&rollouts[k].gradient[..size]) {
             *action -= settings.step_size * *gradient;
@@ -204,7 +204,7 @@ impl<T: Element> Workspace<T> {
         x_g_hat: &mut [T],
     ) {
         let Self { rollouts, buffers, actions_hat, actions_dot, x, x_hat, .. } = self;
-        let Rollout { steps, miss, .. } = &mut rollouts[k];
+        let Rollout { steps, goal_error, .. } = &mut rollouts[k];
         for (dot, hat) in actions_dot.iter_mut().zip(&*actions_hat) {
             *dot = -settings.step_size * *hat;
         }
@@ -215,8 +215,8 @@ impl<T: Element> Workspace<T> {
             network.jvp(rows, t == 0, step, &actions_dot[t * size..][..size], x_dot, buffers);
         }
         // Where the Huber loss is quadratic.
-        for (((x_hat, x_g_hat), x_dot), miss) in x_hat.iter_mut().zip(x_g_hat).zip(x_dot).zip(miss) {
-            *x_hat = if clamp(*miss) == *miss { *x_dot } else { T::ZERO };
+        for (((x_hat, x_g_hat), x_dot), error) in x_hat.iter_mut().zip(x_g_hat).zip(x_dot).zip(goal_error) {
+            *x_hat = if huber_grad(*error) == *error { *x_dot } else { T::ZERO };
             *x_g_hat -= *x_hat;
         }
     }

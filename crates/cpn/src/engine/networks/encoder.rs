@@ -12,7 +12,7 @@ use crate::engine::layers::winograd_transform::PADDING;
 use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
 use crate::engine::simd::element::Element;
 use crate::images::{BYTES, CHANNELS, SIZE};
-use crate::method::Observed;
+use crate::observation::Observed;
 use crate::precision::Precision;
 use pulp::{Arch, Simd, WithSimd};
 use std::mem::swap;
