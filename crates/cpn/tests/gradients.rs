@@ -7,7 +7,7 @@ mod common;
 use common::{double_agent, encoders, frames, noise_images, position_config, small_config, uniform};
 use cpn::config::ConvConfig;
 use cpn::encoder::Precision;
-use cpn::engine::{Embedder, OuterLoop, Samples, Weights};
+use cpn::engine::{EncoderPass, OuterLoop, Samples, Weights};
 use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, loss};
 use proptest::prelude::*;
 use std::collections::HashMap;
@@ -104,12 +104,12 @@ fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
     (&reference * &hat).sum(None::<Kind>).backward();
 
     let variables = Named(agent.variables().variables());
-    let mut embedder = Embedder::<f64>::new(config.encoder.clone(), Precision::Float32, threads);
+    let mut encoder_pass = EncoderPass::<f64>::new(config.encoder.clone(), Precision::Float32, threads);
     // Again, from what the passes before left.
     for _ in 0..2 {
-        let (embeddings, embedded) = embedder.forward(&variables, frames.observed());
+        let (embeddings, embedded) = encoder_pass.forward(&variables, frames.observed());
         assert_close(config, "embeddings", &embeddings, &reference);
-        let weights = embedded.adjoint(&floats(&hat));
+        let weights = embedded.vjp(&floats(&hat));
         for (name, ours) in &weights {
             assert_close(config, name, ours, &gradient(&variables.0[name]));
         }

@@ -14,8 +14,8 @@ pub fn relu_mask<T: Element>(x: &mut [T], activations: &[T]) {
     Arch::new().dispatch(Mask { x, activations });
 }
 
-/// Active columns of each row of a matrix, by ranges of columns: the others are zero after a rectified linear unit, so that what
-/// they are multiplied by is not needed, neither forward nor back.
+/// Active columns of each row of a matrix, by ranges of columns: the others are zero after a rectified linear unit, so that their
+/// factors are not needed, neither forward nor back.
 #[derive(Debug)]
 pub struct ActiveSet {
     rows: usize,
