@@ -52,7 +52,7 @@ impl Agent {
     }
 
     /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates, all of it by
-    /// autograd: the reference for [`loss::OuterLoss`].
+    /// autograd: the reference for [`OuterLoss`](crate::engine::OuterLoss).
     pub fn outer_loss(&self, batch: &Batch) -> Tensor {
         let embeddings = self.encoder.encode(&batch.frames.tensor());
         let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));

@@ -1,28 +1,11 @@
 //! The encoder f_φ, shared by observation and goal (figure "encoder", a).
 
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
-use crate::{fused, images, positions};
-use serde::{Deserialize, Serialize};
+use crate::{images, positions};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
 
-/// What the encoder of images multiplies, in its convolutions and its last layer; all else is float32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Precision {
-    /// Numbers as they are.
-    Float32,
-    /// Numbers rounded to 8 bits, whose products are added up in float32: close, and faster where the processor has instructions
-    /// for it (AVX512-BF16). Elsewhere slower.
-    Bfloat16,
-}
-
-impl Precision {
-    /// The same, or float32 where the processor has no instructions for bfloat16.
-    pub fn where_faster(self) -> Self {
-        if fused::bfloat16_is_fast() { self } else { Self::Float32 }
-    }
-}
+pub use crate::precision::Precision;
 
 /// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]

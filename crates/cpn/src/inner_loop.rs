@@ -1,5 +1,5 @@
 //! The inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks"), by
-//! autograd. What is served does the same without a graph ([`crate::fused`]).
+//! autograd. What is served does the same without a graph ([`crate::engine`]).
 
 use crate::dynamics::PolicyDynamics;
 use tch::{Kind, Reduction, Tensor};

@@ -4,7 +4,7 @@
 //! image of a finished task and plans towards it in a learned latent space. The files of this crate are the paper's
 //! ideas, one each: [`encoder`] (f_φ), [`neuromodulated`] (the layer with attenuated weights), [`dynamics`] (g_θ, the
 //! combined policy and dynamics), [`inner_loop`], [`loss`] (the outer loop); [`agent`] puts them together for each of the
-//! compared methods. [`fused`] does the same fast: [`Planner`] serves an agent's plans, as a [`method`].
+//! compared methods. [`engine`] does the same by hand-derived passes, without a graph: [`Planner`] serves an agent's plans, as a [`method`].
 //!
 //! | symbol | name here | meaning |
 //! |---|---|---|
@@ -26,18 +26,21 @@ pub mod checkpoint;
 pub mod config;
 pub mod dynamics;
 pub mod encoder;
-pub mod fused;
+pub mod engine;
 pub mod images;
 pub mod inner_loop;
 pub mod loss;
 pub mod method;
 pub mod neuromodulated;
+mod observation;
 pub mod positions;
+mod precision;
 pub mod recipe;
+mod search;
 mod unique;
 
 pub use agent::Agent;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
-pub use fused::Planner;
+pub use engine::Planner;
 pub use method::{Frames, Method, Plan, Random};
 pub use recipe::{Preset, Recipe, Training};

@@ -1,7 +1,7 @@
 //! What a model is trained by, and the named choices of it.
 
 use crate::config::{ConfigError, EncoderConfig, Input, MethodKind, ModelConfig, in_range};
-use crate::encoder::Precision;
+use crate::precision::Precision;
 use serde::{Deserialize, Serialize};
 
 /// Which later frame of a demonstration a sample is to reach.

@@ -6,7 +6,8 @@ mod common;
 
 use common::{frames, noise_images, uniform};
 use cpn::encoder::Precision;
-use cpn::loss::{Batch, OuterLoss};
+use cpn::engine::OuterLoss;
+use cpn::loss::Batch;
 use cpn::{Agent, MethodKind, ModelConfig};
 use tch::{Kind, Tensor};
 

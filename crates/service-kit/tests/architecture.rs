@@ -1,9 +1,12 @@
-//! The direction of dependencies: services know the libraries; of these, only recordings know another, the messages.
+//! The direction of dependencies: services know the libraries; of these, only recordings know another, the messages. Within the
+//! method, files import each other in one direction, and the engine's storeys only those below.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::Path;
 use std::process::Command;
 
 /// The names of the dependencies of each crate of the workspace, but for those of tests.
@@ -55,4 +58,136 @@ fn the_method_knows_no_network_and_messages_no_tensors() {
     assert!(!knows("signing", &["tch", "tokio", "tracing"]));
     assert!(!knows("recording", &["tch", "tokio", "zenoh"]));
     assert!(!knows("evaluator", &["tch"]));
+}
+
+/// Storeys of `crates/cpn/src/engine`, from the lowest.
+const STOREYS: [&str; 6] = ["simd", "gemm", "layers", "networks", "planning", "training"];
+
+/// A module by the segments of its path, none for the crate itself.
+type Module = Vec<String>;
+
+/// Sources of a folder by module, without comments and the tests at a file's end.
+fn sources(folder: &Path, module: &[String], modules: &mut BTreeMap<Module, String>) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        if path.is_dir() {
+            sources(&path, &[module, &[name]].concat(), modules);
+        } else {
+            let source = fs::read_to_string(&path).unwrap();
+            let code = source.split("#[cfg(test)]\nmod").next().unwrap().lines();
+            let code = code.map(|line| line.split("//").next().unwrap()).collect::<Vec<_>>().join("\n");
+            let is_root = name == "lib" || name == "mod";
+            modules.insert(if is_root { module.to_vec() } else { [module, &[name]].concat() }, code);
+        }
+    }
+}
+
+/// `a::{b, c::{d, self}}` as `a::b`, `a::c::d` and `a::c`.
+fn expand(tree: &str) -> Vec<String> {
+    let Some((prefix, group)) = tree.split_once('{') else { return vec![tree.trim().replace("::self", "")] };
+    let group = group.trim_end().strip_suffix('}').unwrap();
+    let (mut depth, mut items) = (0, vec![String::new()]);
+    for c in group.chars() {
+        depth += i32::from(c == '{') - i32::from(c == '}');
+        match c {
+            ',' if depth == 0 => items.push(String::new()),
+            c => items.last_mut().unwrap().push(c),
+        }
+    }
+    let items = items.iter().filter(|item| !item.trim().is_empty());
+    items.flat_map(|item| expand(&format!("{}{}", prefix.trim(), item.trim()))).collect()
+}
+
+/// Paths that code imports, by `use` or in place.
+fn paths(code: &str) -> Vec<String> {
+    let (mut paths, mut rest) = (Vec::new(), String::new());
+    for (i, part) in code.split("use ").enumerate() {
+        match part.split_once(';') {
+            Some((tree, behind)) if i > 0 => {
+                paths.extend(expand(tree));
+                rest.push_str(behind);
+            }
+            _ => rest.push_str(part),
+        }
+    }
+    let words = rest.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':'));
+    paths.extend(words.filter(|word| word.starts_with("crate::") || word.starts_with("super::")).map(str::to_owned));
+    paths
+}
+
+/// The module that a path lies in, as seen from another; none if it is of another crate.
+fn resolve(path: &str, from: &Module, modules: &BTreeMap<Module, String>) -> Option<Module> {
+    let mut segments: Vec<_> = path.split("::").map(|segment| segment.split(' ').next().unwrap().to_owned()).collect();
+    let mut base = from.clone();
+    match segments[0].as_str() {
+        "crate" => base.clear(),
+        "super" | "self" => {}
+        child if modules.contains_key(&[&from[..], &[child.to_owned()]].concat()) => {
+            segments.insert(0, "self".to_owned())
+        }
+        _ => return None,
+    }
+    for segment in segments {
+        match segment.as_str() {
+            "crate" | "self" => {}
+            "super" => drop(base.pop()),
+            name if modules.contains_key(&[&base[..], &[name.to_owned()]].concat()) => base.push(name.to_owned()),
+            _ => break,
+        }
+    }
+    Some(base)
+}
+
+/// The modules of `crates/cpn/src` that each of them imports.
+fn imports() -> BTreeMap<Module, BTreeSet<Module>> {
+    let mut modules = BTreeMap::new();
+    sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../cpn/src"), &[], &mut modules);
+    let of = |(module, code): (&Module, &String)| {
+        let all = paths(code).into_iter().filter_map(|path| resolve(&path, module, &modules));
+        (module.clone(), all.filter(|imported| imported != module).collect())
+    };
+    modules.iter().map(of).collect()
+}
+
+#[test]
+fn no_file_of_the_method_imports_one_that_imports_it() {
+    let mut left = imports();
+    assert!(left[&vec!["agent".to_owned()]].contains(&vec!["loss".to_owned()]), "imports are found: {left:?}");
+    loop {
+        // A file all of whose imports are known to lie below has its place.
+        let placed: Vec<_> = left.iter().filter(|(_, known)| known.is_empty()).map(|(file, _)| file.clone()).collect();
+        if placed.is_empty() {
+            break;
+        }
+        for file in placed {
+            left.remove(&file);
+            left.values_mut().for_each(|known| known.retain(|other| *other != file));
+        }
+    }
+    assert!(left.is_empty(), "circles of imports, or what lies above one: {left:#?}");
+}
+
+#[test]
+fn storeys_of_the_engine_use_only_those_below() {
+    let storey = |module: &Module| {
+        let name = module.get(1).filter(|_| module[0] == "engine")?;
+        Some(STOREYS.iter().position(|storey| storey == name).unwrap_or_else(|| panic!("no storey: {module:?}")))
+    };
+    let imports = imports();
+    let above = STOREYS.map(|name| vec!["engine".to_owned(), name.to_owned()]);
+    assert!(above.iter().all(|storey| imports.contains_key(storey)), "each storey is there");
+    for (module, imported) in &imports {
+        for other in imported {
+            if let (Some(ours), Some(theirs)) = (storey(module), storey(other)) {
+                assert!(theirs <= ours, "{module:?} imports {other:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn groups_of_imports_are_taken_apart() {
+    assert_eq!(expand("a::{b, c::{d, self}, e as f}"), ["a::b", "a::c::d", "a::c", "a::e as f"]);
+    assert_eq!(paths("use a::{b};\nfn f() { crate::c::d(super::e) }"), ["a::b", "crate::c::d", "super::e"]);
 }

@@ -24,11 +24,11 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
     for task in tasks {
         ensure!(all_tasks.contains(task), "tasks: expected some of {all_tasks:?}, got {task:?}");
     }
-    let wanted = |path: &Path| {
+    let selected = |path: &Path| {
         tasks.is_empty()
             || path.parent().and_then(Path::file_name).is_some_and(|name| tasks.iter().any(|t| name == &**t))
     };
-    let paths: Vec<_> = folder::paths(folder)?.into_iter().filter(|path| wanted(path)).collect();
+    let paths: Vec<_> = folder::paths(folder)?.into_iter().filter(|path| selected(path)).collect();
     if let Some(duplicate) = folder::duplicates(&paths).into_iter().next() {
         bail!(duplicate);
     }

@@ -1,7 +1,7 @@
 //! The Adam optimiser (Kingma and Ba, 2015) with a state that can be saved, which libtorch's own cannot from here.
 
 use cpn::archive::Tensors;
-use cpn::loss::Gradient;
+use cpn::engine::Gradient;
 use tch::{Kind, Tensor, nn};
 
 const BETA_1: f32 = 0.9;

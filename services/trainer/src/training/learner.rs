@@ -2,7 +2,8 @@
 
 use crate::training::adam::Adam;
 use anyhow::ensure;
-use cpn::loss::{Batch, OuterLoss};
+use cpn::engine::OuterLoss;
+use cpn::loss::Batch;
 use cpn::{Agent, Recipe};
 use serde::Serialize;
 use std::time::Instant;

@@ -1,0 +1,13 @@
+//! Layers, each with its passes over a block of R samples, by hand. [`passes`] has the names of their arguments.
+
+pub mod conv2d;
+pub mod conv2d_params;
+pub mod dense;
+pub mod layer_norm;
+pub mod linear;
+pub mod neuromodulated;
+pub mod passes;
+pub mod projection;
+pub mod relu;
+pub mod winograd;
+pub mod winograd_transform;

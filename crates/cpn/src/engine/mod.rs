@@ -1,0 +1,37 @@
+//! The outer loss and its gradient without an autograd graph: the passes over g_θ are derived by hand.
+//!
+//! A training step differentiates through the inner loop, and so through a gradient. In terms of one layer y = f(x):
+//!
+//! | pass | computes | what it is for |
+//! |---|---|---|
+//! | forward | y | the rollout |
+//! | backward | x̄ = (∂y/∂x)ᵀ ȳ | the inner loop's gradient in the actions |
+//! | tangent | ẏ = (∂y/∂x) ẋ | how that gradient acts along the direction the outer loss gives |
+//! | adjoint | x̂ = ∂Φ/∂x and ∂Φ/∂θ, Φ = ŷᵀy + ȳᵀẏ | the outer gradient, both orders in one pass |
+//!
+//! The last row is what makes this cheap: the adjoint of ẏ is ȳ, which the inner loop has computed already, so that the
+//! second order costs two passes more than the first and nothing is recorded but what the passes leave on a [tape](layers::dense).
+//! In the words of JAX and PyTorch, and of the code, backward is `vjp`, tangent `jvp` and adjoint `double_backward`; an adjoint of
+//! the first order alone, as in the encoder, is a `vjp` with the weights among its inputs.
+//! The same quantities serve both branches of g_θ, and the policy's rollout is also the first rollout of the inner loop.
+//!
+//! Six storeys, each of which uses only those before it: `simd` (registers), `gemm` (matrix products), `layers`, `networks`,
+//! `planning` (the inner loop and the searches) and `training` (the outer loop).
+//!
+//! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
+//! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
+//! ([`EncoderPass`]). Tested against autograd in float64 (`tests/gradients.rs`).
+
+pub(crate) mod gemm;
+pub(crate) mod layers;
+pub(crate) mod networks;
+pub(crate) mod planning;
+pub(crate) mod simd;
+pub(crate) mod training;
+
+pub use layers::linear::Weights;
+pub use planning::planner::Planner;
+pub use simd::element::Element;
+pub use training::encoder_pass::EncoderPass;
+pub use training::outer_loop::{OuterLoop, Samples};
+pub use training::outer_loss::{Gradient, OuterLoss};

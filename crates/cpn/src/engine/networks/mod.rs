@@ -1,0 +1,5 @@
+//! The networks: the encoder f_φ and the combined policy and dynamics g_θ, each with its passes.
+
+pub mod encoder;
+pub mod policy_dynamics;
+pub mod variables;

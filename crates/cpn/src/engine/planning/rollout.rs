@@ -1,0 +1,132 @@
+//! The inner loop's rollout of g_θ, its distance to the goal, and the gradient of that distance in the actions.
+
+use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics, StepTape};
+use crate::engine::simd::element::Element;
+
+/// A rollout over a block of R samples.
+#[derive(Debug)]
+pub struct Rollout<T> {
+    /// Tapes of the H steps.
+    pub steps: Vec<StepTape<T>>,
+    /// x_H - x_g, `[R, Z]`.
+    pub goal_error: Vec<T>,
+    /// The inner loss' gradient in the actions, `[H, R, A]`.
+    pub gradient: Vec<T>,
+}
+
+/// Source of a rollout's actions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Actions {
+    /// Given actions.
+    Given,
+    /// The actions of the rollout before, moved down its loss: the first step sees the same state again.
+    Moved,
+    /// Actions that the policy proposes along the way.
+    Proposed,
+}
+
+/// Purpose of a rollout.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// The policy's actions; the state after the last is not computed.
+    Actions,
+    /// The inner loss alone: the steps may share a tape, which stays in the caches.
+    Loss,
+    /// The inner loss, and its gradient afterwards.
+    Gradient,
+}
+
+impl<T: Element> Rollout<T> {
+    /// A rollout of H = `horizon` steps for blocks of up to R = `rows` samples.
+    pub fn new(network: &PolicyDynamics<T>, rows: usize, horizon: usize) -> Self {
+        Self {
+            steps: (0..horizon).map(|_| network.tape(rows)).collect(),
+            goal_error: vec![T::ZERO; rows * network.sizes.latent],
+            gradient: vec![T::ZERO; horizon * rows * network.sizes.actions],
+        }
+    }
+
+    /// The states along the actions, `[H, R, A]`, in place of x, `[R, Z]`, and the error towards x_g, `[R, Z]`. Proposed actions
+    /// are written to `actions`.
+    pub fn forward(
+        &mut self,
+        network: &PolicyDynamics<T>,
+        (x, x_g): (&mut [T], &[T]),
+        (source, actions): (Actions, &mut [T]),
+        purpose: Purpose,
+        buffers: &mut Buffers<T>,
+    ) {
+        let rows = x.len() / network.sizes.latent;
+        let horizon = self.steps.len();
+        for (t, action) in actions.chunks_mut(rows * network.sizes.actions).take(horizon).enumerate() {
+            let step = &mut self.steps[if purpose == Purpose::Loss { 0 } else { t }];
+            if t > 0 || source != Actions::Moved {
+                network.features(rows, step, x, x_g);
+            }
+            if source == Actions::Proposed {
+                network.policy(rows, step, action);
+            }
+            if purpose != Purpose::Actions || t + 1 < horizon {
+                network.next(rows, step, action, x, buffers);
+            }
+        }
+
+        for (error, (x, x_g)) in self.goal_error.iter_mut().zip(x.iter().zip(x_g)) {
+            *error = *x - *x_g;
+        }
+    }
+
+    /// The gradient in the actions of the Huber loss (δ = 1) between x_H and x_g, left in [`Self::gradient`]. `x_bar`, `[R, Z]`, is
+    /// a buffer for the gradients in the states.
+    pub fn vjp(&mut self, network: &PolicyDynamics<T>, x_bar: &mut [T], buffers: &mut Buffers<T>) {
+        let rows = x_bar.len() / network.sizes.latent;
+        for (x_bar, error) in x_bar.iter_mut().zip(&self.goal_error) {
+            *x_bar = huber_grad(*error);
+        }
+
+        let gradients = self.gradient.chunks_mut(rows * network.sizes.actions);
+        for (t, (step, gradient)) in self.steps.iter_mut().zip(gradients).enumerate().rev() {
+            network.vjp(rows, t == 0, step, x_bar, gradient, buffers);
+        }
+    }
+
+    /// The inner loss of each of the R samples, summed over the latent.
+    pub fn losses(&self, network: &PolicyDynamics<T>, rows: usize) -> impl Iterator<Item = T> {
+        self.goal_error.chunks_exact(network.sizes.latent).take(rows).map(huber_loss)
+    }
+}
+
+/// The Huber loss with δ = 1, summed: |e| - 1/2 beyond 1, e²/2 within.
+fn huber_loss<T: Element>(errors: &[T]) -> T {
+    let half = T::ONE / (T::ONE + T::ONE);
+    errors.iter().map(|error| huber_grad(*error) * (*error - half * huber_grad(*error))).sum()
+}
+
+/// The derivative of the Huber loss with δ = 1: the error, clamped to [-1, 1].
+pub fn huber_grad<T: Element>(error: T) -> T {
+    if error > T::ONE {
+        T::ONE
+    } else if error < -T::ONE {
+        -T::ONE
+    } else {
+        error
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_loss_is_hubers_and_the_gradient_its_derivative() {
+        for i in -30..=30 {
+            let error = f64::from(i) * 0.1 + 0.03;
+            let expected = if error.abs() > 1.0 { error.abs() - 0.5 } else { error * error / 2.0 };
+            assert!((huber_loss(&[error]) - expected).abs() < 1e-12, "{error}");
+            let difference = (huber_loss(&[error + 1e-6]) - huber_loss(&[error - 1e-6])) / 2e-6;
+            assert!((huber_grad(error) - difference).abs() < 1e-6, "{error}");
+        }
+        assert_eq!(huber_loss(&[2.0, -3.0, 0.5]), 1.5 + 2.5 + 0.125);
+        assert!(huber_grad(f64::NAN).is_nan());
+    }
+}

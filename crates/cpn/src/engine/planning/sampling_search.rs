@@ -1,0 +1,243 @@
+//! Sampling-based searches: CEM, MPPI and CEM with a gradient step.
+
+use super::rollout::{Actions, Purpose};
+use super::worker::{BLOCK, Dynamics, Worker};
+use crate::search::{Plan, Query, Solver};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+
+/// Standard deviation of the first generation, of actions from -1 to 1; MPPI keeps it.
+const INITIAL_STD: f32 = 0.5;
+/// Lower bound of CEM's standard deviation, so that it goes on exploring.
+const MIN_STD: f32 = 0.05;
+/// Plans of a generation for each elite, one of the best that the next generation is drawn around.
+const PLANS_PER_ELITE: usize = 8;
+/// Temperature of MPPI, in standard deviations of the generation's losses.
+const TEMPERATURE: f32 = 0.1;
+
+/// A plan of actions `[H][A]` with its inner loss.
+#[derive(Debug, Clone)]
+struct Candidate {
+    actions: Vec<Vec<f32>>,
+    loss: f32,
+}
+
+/// The normal distribution that the next generation is drawn from.
+#[derive(Debug)]
+struct ActionDistribution {
+    /// `[H][A]`.
+    mean: Vec<Vec<f32>>,
+    /// Standard deviation, `[H][A]`.
+    std: Vec<Vec<f32>>,
+}
+
+/// A search by generations, from the policy's actions or the query's own; the same for the same seed. It can be suspended after any
+/// piece of a generation and resumed.
+#[derive(Debug)]
+pub struct SamplingSearch {
+    rng: ChaCha8Rng,
+    best: Candidate,
+    distribution: ActionDistribution,
+    /// Inner loss of the best plan before each generation and after the last.
+    inner_losses: Vec<f32>,
+    /// Number of generations after which the best plan was found.
+    best_iteration: usize,
+    /// Number of whole generations.
+    pub done: usize,
+    /// The plans of the next generation that have been tried.
+    generation: Vec<Candidate>,
+    /// Number of rollouts so far.
+    pub rollouts: usize,
+}
+
+impl SamplingSearch {
+    /// The first rollout, of the plan that the first generation is drawn around.
+    pub fn begin(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>) -> Self {
+        let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
+        worker.set_plan(dynamics, 1, 0, query.start);
+        let loss = roll_out(worker, dynamics, query, (source, Purpose::Loss));
+        let best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+        let std = best.actions.iter().map(|action| vec![INITIAL_STD; action.len()]).collect();
+        Self {
+            rng: ChaCha8Rng::seed_from_u64(query.seed),
+            distribution: ActionDistribution { mean: best.actions.clone(), std },
+            best,
+            inner_losses: vec![loss],
+            best_iteration: 0,
+            done: 0,
+            generation: Vec::new(),
+            rollouts: 1,
+        }
+    }
+
+    /// A piece of a generation: a block of plans for each worker and, with the last of a generation, its fit.
+    pub fn advance(&mut self, workers: &mut [Worker<f32>], dynamics: &Dynamics<f32>, query: Query<'_>, solver: Solver) {
+        let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { return };
+        let tried = self.generation.len();
+        let piece = (count - tried).min(BLOCK * workers.len());
+        self.generation.extend(self.distribution.sample(piece, &mut self.rng));
+        evaluate(workers, dynamics, query, &mut self.generation[tried..]);
+        self.rollouts += piece;
+        if self.generation.len() == count {
+            self.fit(&mut workers[0], dynamics, query, solver);
+        }
+    }
+
+    /// The end of a generation: fits the distribution to it, and keeps the best plan.
+    fn fit(&mut self, worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, solver: Solver) {
+        self.done += 1;
+        let mut generation = std::mem::take(&mut self.generation);
+        generation.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        let mut best = generation[0].clone();
+        match solver {
+            Solver::Mppi(_) => self.distribution.mean = weighted_mean(&generation),
+            _ => {
+                let elites = (generation.len() / PLANS_PER_ELITE).max(2).min(generation.len());
+                self.distribution = fit_elites(&generation[..elites]);
+            }
+        }
+
+        if let Solver::Hybrid(_) = solver {
+            worker.set_plan(dynamics, 1, 0, &self.distribution.mean);
+            roll_out(worker, dynamics, query, (Actions::Given, Purpose::Gradient));
+            worker.descend(dynamics, 1);
+            let loss = roll_out(worker, dynamics, query, (Actions::Moved, Purpose::Loss));
+            let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+            if descended.loss < best.loss {
+                self.distribution.mean.clone_from(&descended.actions);
+                best = descended;
+            }
+        }
+
+        if best.loss < self.best.loss {
+            (self.best, self.best_iteration) = (best, self.done);
+        }
+        self.inner_losses.push(self.best.loss);
+    }
+
+    /// The best plan of the generations that are whole.
+    pub fn into_plan(self) -> Plan {
+        Plan { actions: self.best.actions, inner_losses: self.inner_losses, iterations: self.best_iteration }
+    }
+}
+
+/// The inner loss of the worker's one plan.
+fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, how: (Actions, Purpose)) -> f32 {
+    worker.roll_out(dynamics, how, [(query.x, query.x_g)].into_iter()).sum()
+}
+
+/// The losses of candidates, a block for each worker at most.
+fn evaluate(workers: &mut [Worker<f32>], dynamics: &Dynamics<f32>, query: Query<'_>, candidates: &mut [Candidate]) {
+    if candidates.len() <= BLOCK {
+        // Another thread would only have to be woken.
+        return evaluate_block(&mut workers[0], dynamics, query, candidates);
+    }
+    let blocks = workers.par_iter_mut().zip(candidates.par_chunks_mut(BLOCK));
+    blocks.for_each(|(worker, block)| evaluate_block(worker, dynamics, query, block));
+}
+
+fn evaluate_block(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, block: &mut [Candidate]) {
+    let rows = block.len();
+    for (r, candidate) in block.iter().enumerate() {
+        worker.set_plan(dynamics, rows, r, &candidate.actions);
+    }
+    let ends = std::iter::repeat_n((query.x, query.x_g), rows);
+    let losses = worker.roll_out(dynamics, (Actions::Given, Purpose::Loss), ends);
+    for (candidate, loss) in block.iter_mut().zip(losses) {
+        candidate.loss = loss;
+    }
+}
+
+impl ActionDistribution {
+    /// `count` plans, clamped to [-1, 1], without losses.
+    fn sample(&self, count: usize, rng: &mut ChaCha8Rng) -> Vec<Candidate> {
+        let mut normal = |mean: f32, std: f32| {
+            let noise: f32 = StandardNormal.sample(rng);
+            (mean + std * noise).clamp(-1.0, 1.0)
+        };
+        let mut action = |(mean, std): (&Vec<f32>, &Vec<f32>)| {
+            mean.iter().zip(std).map(|(mean, std)| normal(*mean, *std)).collect::<Vec<_>>()
+        };
+        let mut plan = || self.mean.iter().zip(&self.std).map(&mut action).collect();
+        (0..count).map(|_| Candidate { actions: plan(), loss: f32::INFINITY }).collect()
+    }
+}
+
+/// Mean and standard deviation of the elites.
+fn fit_elites(elites: &[Candidate]) -> ActionDistribution {
+    let share = 1.0 / elites.len() as f32;
+    let mean = mean(elites.iter().map(|elite| (share, &elite.actions)));
+    let std = |t: usize, i: usize| {
+        let squares = elites.iter().map(|elite| (elite.actions[t][i] - mean[t][i]).powi(2));
+        (share * squares.sum::<f32>()).sqrt().max(MIN_STD)
+    };
+    let std = (0..mean.len()).map(|t| (0..mean[t].len()).map(|i| std(t, i)).collect()).collect();
+    ActionDistribution { mean, std }
+}
+
+/// The mean of a sorted generation, weighted by exp(-loss / temperature).
+fn weighted_mean(generation: &[Candidate]) -> Vec<Vec<f32>> {
+    let count = generation.len() as f32;
+    let centre = generation.iter().map(|candidate| candidate.loss).sum::<f32>() / count;
+    let variance = generation.iter().map(|candidate| (candidate.loss - centre).powi(2)).sum::<f32>() / count;
+    let temperature = (TEMPERATURE * variance.sqrt()).max(f32::MIN_POSITIVE);
+    let least = generation[0].loss;
+    let weights: Vec<f32> = generation.iter().map(|candidate| ((least - candidate.loss) / temperature).exp()).collect();
+    let sum: f32 = weights.iter().sum();
+    mean(generation.iter().zip(weights).map(|(candidate, weight)| (weight / sum, &candidate.actions)))
+}
+
+/// The weighted sum of plans.
+fn mean<'a>(weighted: impl Iterator<Item = (f32, &'a Vec<Vec<f32>>)>) -> Vec<Vec<f32>> {
+    let mut sum: Vec<Vec<f32>> = Vec::new();
+    for (weight, actions) in weighted {
+        if sum.is_empty() {
+            sum = actions.iter().map(|action| vec![0.0; action.len()]).collect();
+        }
+        for (sum, value) in sum.iter_mut().flatten().zip(actions.iter().flatten()) {
+            *sum += weight * value;
+        }
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn candidate(actions: [f32; 2], loss: f32) -> Candidate {
+        Candidate { actions: vec![vec![actions[0]], vec![actions[1]]], loss }
+    }
+
+    #[test]
+    fn elites_are_fitted_by_mean_and_standard_deviation() {
+        let fitted = fit_elites(&[candidate([0.5, 0.25], 0.0), candidate([-0.5, 0.25], 1.0)]);
+        assert_eq!(fitted.mean, [[0.0], [0.25]]);
+        assert_eq!(fitted.std, [[0.5], [MIN_STD]]);
+    }
+
+    /// Weights fall by e for each temperature, a tenth of the losses' standard deviation.
+    #[test]
+    fn the_weighted_mean_follows_the_best() {
+        let mean = weighted_mean(&[candidate([1.0, 0.0], 0.0), candidate([0.0, 1.0], 2.0)]);
+        let worse = (-20.0f32).exp();
+        assert!((mean[1][0] - worse / (1.0 + worse)).abs() < 1e-12, "{mean:?}");
+        assert!((mean[0][0] - 1.0).abs() < 1e-6, "{mean:?}");
+        // Equal losses weigh the same.
+        let mean = weighted_mean(&[candidate([1.0, 0.0], 3.0), candidate([0.0, 0.5], 3.0)]);
+        assert_eq!(mean, [[0.5], [0.25]]);
+    }
+
+    #[test]
+    fn samples_follow_the_distribution_within_the_actions_range() {
+        let distribution = ActionDistribution { mean: vec![vec![0.2, 0.9]], std: vec![vec![0.1, 0.5]] };
+        let sample = distribution.sample(4000, &mut ChaCha8Rng::seed_from_u64(1));
+        let actions = |i: usize| sample.iter().map(move |candidate| candidate.actions[0][i]);
+        let mean = actions(0).sum::<f32>() / 4000.0;
+        let variance = actions(0).map(|a| (a - mean).powi(2)).sum::<f32>() / 4000.0;
+        assert!((mean - 0.2).abs() < 0.01 && (variance.sqrt() - 0.1).abs() < 0.01, "{mean} {variance}");
+        assert!(actions(1).all(|a| (-1.0..=1.0).contains(&a)) && actions(1).any(|a| a == 1.0));
+    }
+}

@@ -1,0 +1,72 @@
+//! The encoder's passes in training: forward over the frames of a batch, and back to its weights.
+
+use crate::config::EncoderConfig;
+use crate::engine::layers::linear::Weights;
+use crate::engine::networks::encoder::{Encoder, EncoderGradient, EncoderTape, GROUP};
+use crate::engine::simd::element::Element;
+use crate::observation::Observed;
+use crate::precision::Precision;
+use rayon::prelude::*;
+
+/// The encoder's passes on some threads, whose tapes are kept from batch to batch.
+#[derive(Debug)]
+pub struct EncoderPass<T: Element> {
+    config: EncoderConfig,
+    precision: Precision,
+    /// The encoder with the weights of the last forward pass.
+    encoder: Option<Encoder<T>>,
+    tapes: Vec<EncoderTape<T>>,
+}
+
+/// EmbeddedFrames frames, for the backward pass from a loss' gradient in their embeddings.
+#[derive(Debug)]
+pub struct EmbeddedFrames<'a, T: Element> {
+    encoder: &'a Encoder<T>,
+    frames: Vec<Observed<'a>>,
+    /// Number of frames of a thread.
+    share: usize,
+    tapes: &'a mut [EncoderTape<T>],
+}
+
+impl<T: Element> EncoderPass<T> {
+    /// Passes of encoders of a valid configuration, on `threads` threads, at least one.
+    pub fn new(config: EncoderConfig, precision: Precision, threads: usize) -> Self {
+        Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| EncoderTape::new()).collect() }
+    }
+
+    /// Embeddings of frames by the current weights, `[F, Z]`.
+    pub fn forward<'a>(
+        &'a mut self,
+        weights: &impl Weights<T>,
+        frames: Vec<Observed<'a>>,
+    ) -> (Vec<T>, EmbeddedFrames<'a, T>) {
+        let encoder = &*self.encoder.insert(Encoder::new(&self.config, self.precision, weights));
+        let share = frames.len().div_ceil(self.tapes.len()).next_multiple_of(GROUP);
+        let parts = self.tapes.par_iter_mut().zip(frames.par_chunks(share));
+        let embeddings: Vec<_> = parts.map(|(tape, frames)| encoder.forward(frames, true, tape)).collect();
+        (embeddings.concat(), EmbeddedFrames { encoder, frames, share, tapes: &mut self.tapes })
+    }
+}
+
+impl<T: Element> EmbeddedFrames<'_, T> {
+    /// The gradient in each weight by its name in a checkpoint, from a loss' gradient in the embeddings, `[F, Z]`. The order of its
+    /// sums depends on nothing but the frames and the number of threads.
+    pub fn vjp(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {
+        let Self { encoder, frames, share, tapes } = self;
+        let x_hats = x_hat.par_chunks(share * encoder.latent());
+        let parts = tapes.par_iter_mut().zip(frames.par_chunks(share)).zip(x_hats);
+        let gradients: Vec<EncoderGradient<T>> = parts
+            .map(|((tape, frames), x_hat)| {
+                let mut gradient = encoder.gradient();
+                encoder.vjp(frames, x_hat.to_vec(), &mut gradient, tape);
+                gradient
+            })
+            .collect();
+
+        // The sum over the threads, in their order.
+        let mut gradients = gradients.into_iter();
+        let mut sum = gradients.next().unwrap_or_else(|| encoder.gradient());
+        gradients.for_each(|gradient| sum.add(&gradient));
+        encoder.in_weights(&sum)
+    }
+}

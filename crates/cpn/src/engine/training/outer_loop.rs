@@ -1,0 +1,350 @@
+//! The outer loop: behaviour cloning through the inner loop, and its gradient, block by block and thread by thread.
+
+use crate::config::ModelConfig;
+use crate::engine::layers::linear::Weights;
+use crate::engine::layers::passes::Order;
+use crate::engine::networks::policy_dynamics::{
+    Branches, Buffers, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
+};
+use crate::engine::planning::rollout::{Actions, Purpose, Rollout, huber_grad};
+use crate::engine::simd::element::Element;
+use crate::engine::simd::vector::add;
+use rayon::prelude::*;
+
+/// R, the samples of a block in training: more, and weights are read less often; fewer, and the passes' intermediates stay nearer.
+const BLOCK: usize = 32;
+
+/// The outer loop on some threads, in memory that is kept from batch to batch.
+#[derive(Debug)]
+pub struct OuterLoop<T> {
+    config: ModelConfig,
+    threads: Vec<ThreadState<T>>,
+}
+
+/// One thread's memory.
+#[derive(Debug, Default)]
+struct ThreadState<T> {
+    tapes: Option<BlockTapes<T>>,
+    accumulators: Option<Accumulators<T>>,
+}
+
+/// The outer loss of a batch and its gradients.
+#[derive(Debug)]
+pub struct OuterGradient<T> {
+    /// The loss.
+    pub loss: T,
+    /// The gradient in x, `[B, Z]`.
+    pub x: Vec<T>,
+    /// The gradient in x_g, `[B, Z]`.
+    pub x_g: Vec<T>,
+    /// The gradient in each weight that takes part, by its name in a checkpoint.
+    pub weights: Vec<(String, Vec<T>)>,
+}
+
+/// Samples of a batch: embeddings and demonstrations.
+#[derive(Debug, Clone, Copy)]
+pub struct Samples<'a, T> {
+    /// x, `[R, Z]`.
+    pub x: &'a [T],
+    /// x_g, `[R, Z]`.
+    pub x_g: &'a [T],
+    /// The demonstrated actions, `[R, H, A]`.
+    pub actions: &'a [T],
+    /// The mask, 1 where the demonstration has an action, else 0, `[R, H]`.
+    pub mask: &'a [T],
+}
+
+/// Settings of inner loop and loss.
+#[derive(Debug, Clone, Copy)]
+struct Settings<T> {
+    /// H.
+    horizon: usize,
+    /// U.
+    updates: usize,
+    /// α.
+    step_size: T,
+    /// The factor of the squared errors: 1 / (A Σ mask), the sum over the whole batch.
+    scale: T,
+}
+
+/// Accumulated loss and gradients of a thread's rows.
+#[derive(Debug)]
+struct Accumulators<T> {
+    /// The outer loss.
+    loss: T,
+    /// The gradient in α.
+    step_size: T,
+    /// The gradient in g_θ.
+    network: PolicyDynamicsGradient<T>,
+}
+
+/// Tapes and intermediates of a block of R samples.
+#[derive(Debug)]
+struct BlockTapes<T> {
+    /// The rollout before each update; one if there is no update.
+    rollouts: Vec<Rollout<T>>,
+    buffers: Buffers<T>,
+    /// Actions by step, then row, `[H, R, A]`.
+    actions: Vec<T>,
+    /// The outer loss' gradient in the actions, likewise.
+    actions_hat: Vec<T>,
+    actions_dot: Vec<T>,
+    /// x along the rollout, then x̄, ẋ or x̂, `[R, Z]`.
+    x: Vec<T>,
+    x_hat: Vec<T>,
+}
+
+impl<'a, T: Element> Samples<'a, T> {
+    /// Number of samples, given Z.
+    fn rows(&self, latent: usize) -> usize {
+        self.x.len() / latent
+    }
+
+    /// The `count` samples from `first` on, given Z.
+    fn part(&self, latent: usize, first: usize, count: usize) -> Self {
+        let rows = self.rows(latent);
+        let cut = |values: &'a [T]| {
+            let columns = values.len() / rows;
+            &values[first * columns..(first + count) * columns]
+        };
+        Self { x: cut(self.x), x_g: cut(self.x_g), actions: cut(self.actions), mask: cut(self.mask) }
+    }
+}
+
+impl<T: Element> OuterLoop<T> {
+    /// An outer loop for models of a valid configuration, on `threads` threads, at least one.
+    pub fn new(config: ModelConfig, threads: usize) -> Self {
+        let state = || ThreadState { tapes: None, accumulators: None };
+        Self { config, threads: (0..threads.max(1)).map(|_| state()).collect() }
+    }
+
+    /// The outer loss of a batch and its gradient. The order of its sums depends on nothing but the batch and the number of
+    /// threads.
+    pub fn run(&mut self, weights: &impl Weights<T>, samples: Samples<'_, T>) -> OuterGradient<T> {
+        let network = PolicyDynamics::new(&self.config, weights);
+        let (horizon, updates) = (self.config.horizon as usize, self.config.updates as usize);
+        let known: T = samples.mask.iter().copied().sum();
+        let settings = Settings {
+            horizon,
+            updates,
+            step_size: weights.get("step_size")[0],
+            scale: T::ONE / (known * T::count(network.sizes.actions)),
+        };
+
+        // A share of the samples for each thread, block by block.
+        let latent = network.sizes.latent;
+        let (mut x, mut x_g) = (vec![T::ZERO; samples.x.len()], vec![T::ZERO; samples.x.len()]);
+        let share = samples.rows(latent).div_ceil(self.threads.len());
+        let shares = x.par_chunks_mut(share * latent).zip(x_g.par_chunks_mut(share * latent));
+        self.threads.par_iter_mut().zip(shares).enumerate().for_each(|(i, (thread, (x, x_g)))| {
+            let accumulators = thread.accumulators.insert(Accumulators::zeros(&network));
+            let tapes = thread.tapes.get_or_insert_with(|| BlockTapes::new(&network, BLOCK, horizon, updates));
+            let blocks = x.chunks_mut(BLOCK * latent).zip(x_g.chunks_mut(BLOCK * latent));
+            for (block, (x, x_g)) in blocks.enumerate() {
+                let first = i * share + block * BLOCK;
+                let samples = samples.part(latent, first, x.len() / latent);
+                tapes.run(&network, settings, samples, (x, x_g), accumulators);
+            }
+        });
+
+        // The sum over the threads, in their order.
+        let mut parts = self.threads.iter_mut().filter_map(|thread| thread.accumulators.take());
+        let mut total = parts.next().unwrap_or_else(|| Accumulators::zeros(&network));
+        parts.for_each(|part| total.add(&part));
+        OuterGradient { loss: total.loss, x, x_g, weights: total.in_weights(&network, updates > 0) }
+    }
+}
+
+impl<T: Element> Accumulators<T> {
+    /// Zeros.
+    fn zeros(network: &PolicyDynamics<T>) -> Self {
+        Self { loss: T::ZERO, step_size: T::ZERO, network: network.gradient() }
+    }
+
+    /// `self += other`.
+    fn add(&mut self, other: &Self) {
+        self.loss += other.loss;
+        self.step_size += other.step_size;
+        self.network.add(&other.network);
+    }
+
+    /// The gradient by the names of the weights, with α if it takes part.
+    fn in_weights(&self, network: &PolicyDynamics<T>, with_step_size: bool) -> Vec<(String, Vec<T>)> {
+        let weights = network.in_weights(&self.network).into_iter();
+        let mut weights: Vec<_> = weights.map(|(name, weight)| (format!("network.{name}"), weight)).collect();
+        if with_step_size {
+            weights.push(("step_size".to_owned(), vec![self.step_size]));
+        }
+        weights
+    }
+}
+
+impl<T: Element> BlockTapes<T> {
+    /// Tapes for blocks of up to R = `rows` samples.
+    fn new(network: &PolicyDynamics<T>, rows: usize, horizon: usize, updates: usize) -> Self {
+        let Sizes { latent, actions, .. } = network.sizes;
+        let zeros = |columns: usize| vec![T::ZERO; rows * columns];
+        Self {
+            rollouts: (0..updates.max(1)).map(|_| Rollout::new(network, rows, horizon)).collect(),
+            buffers: network.buffers(rows),
+            actions: zeros(horizon * actions),
+            actions_hat: zeros(horizon * actions),
+            actions_dot: zeros(horizon * actions),
+            x: zeros(latent),
+            x_hat: zeros(latent),
+        }
+    }
+
+    /// The outer loss of a block, forward and backward: adds to `accumulators`; writes x̂ and x̂_g, the loss' gradients in x and x_g,
+    /// `[R, Z]`.
+    fn run(
+        &mut self,
+        network: &PolicyDynamics<T>,
+        settings: Settings<T>,
+        samples: Samples<'_, T>,
+        (x_hat, x_g_hat): (&mut [T], &mut [T]),
+        accumulators: &mut Accumulators<T>,
+    ) {
+        let rows = samples.x.len() / network.sizes.latent;
+        x_hat.fill(T::ZERO);
+        x_g_hat.fill(T::ZERO);
+
+        // Plan from each x towards its x_g, and compare with the demonstration.
+        for k in 0..self.rollouts.len() {
+            self.roll_out(network, settings, samples, k);
+            if settings.updates > 0 {
+                self.update(network, settings, rows, k);
+            }
+        }
+        accumulators.loss += self.behaviour_cloning_loss(network.sizes, settings, samples, rows);
+
+        // Back through the updates and their rollouts.
+        for k in (0..self.rollouts.len()).rev() {
+            if settings.updates > 0 {
+                accumulators.step_size -= self.step_size_hat(network.sizes, rows, k);
+                self.begin_update_backward(network, settings, rows, k, x_g_hat);
+            } else {
+                self.x_hat[..x_hat.len()].fill(T::ZERO);
+            }
+            self.rollout_backward(network, settings, rows, k, x_g_hat, &mut accumulators.network);
+            add(x_hat, &self.x_hat[..x_hat.len()]);
+        }
+    }
+
+    /// Rollout k: along the policy's actions if it is the first, along the plan's otherwise.
+    fn roll_out(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, samples: Samples<'_, T>, k: usize) {
+        let Self { rollouts, buffers, actions, x, .. } = self;
+        let x = &mut x[..samples.x.len()];
+        x.copy_from_slice(samples.x);
+        let source = if k == 0 { Actions::Proposed } else { Actions::Given };
+        let purpose = if settings.updates > 0 { Purpose::Gradient } else { Purpose::Actions };
+        rollouts[k].forward(network, (x, samples.x_g), (source, actions), purpose, buffers);
+    }
+
+    /// Update k of the actions: a step down the inner loss, by its gradient in the actions.
+    fn update(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, rows: usize, k: usize) {
+        let Self { rollouts, buffers, actions, x, .. } = self;
+        rollouts[k].vjp(network, &mut x[..rows * network.sizes.latent], buffers);
+        let size = settings.horizon * rows * network.sizes.actions;
+        for (action, gradient) in actions.iter_mut().zip(&rollouts[k].gradient[..size]) {
+            *action -= settings.step_size * *gradient;
+        }
+    }
+
+    /// The outer loss, the mean squared error of the actions; leaves its gradient in the planned actions.
+    fn behaviour_cloning_loss(
+        &mut self,
+        sizes: Sizes,
+        settings: Settings<T>,
+        samples: Samples<'_, T>,
+        rows: usize,
+    ) -> T {
+        let mut loss = T::ZERO;
+        for t in 0..settings.horizon {
+            for r in 0..rows {
+                let (at, demonstrated) = ((t * rows + r) * sizes.actions, (r * settings.horizon + t) * sizes.actions);
+                let scale = samples.mask[r * settings.horizon + t] * settings.scale;
+                for i in 0..sizes.actions {
+                    let error = self.actions[at + i] - samples.actions[demonstrated + i];
+                    loss += scale * error * error;
+                    self.actions_hat[at + i] = (scale + scale) * error;
+                }
+            }
+        }
+        loss
+    }
+
+    /// The loss' decrease by α in update k, ∂/∂α.
+    fn step_size_hat(&self, sizes: Sizes, rows: usize, k: usize) -> T {
+        let size = self.rollouts[k].steps.len() * rows * sizes.actions;
+        self.actions_hat[..size].iter().zip(&self.rollouts[k].gradient).map(|(hat, gradient)| *hat * *gradient).sum()
+    }
+
+    /// The first half of the way back through update k, a ← a - α ∂L/∂a: the loss' derivative in ∂L/∂a is ȧ = -α â, and its
+    /// derivative in all that ∂L/∂a depends on is that of L's tangent along ȧ, whose passes begin here and end in
+    /// [`Self::rollout_backward`].
+    fn begin_update_backward(
+        &mut self,
+        network: &PolicyDynamics<T>,
+        settings: Settings<T>,
+        rows: usize,
+        k: usize,
+        x_g_hat: &mut [T],
+    ) {
+        let Self { rollouts, buffers, actions_hat, actions_dot, x, x_hat, .. } = self;
+        let Rollout { steps, goal_error, .. } = &mut rollouts[k];
+        for (dot, hat) in actions_dot.iter_mut().zip(&*actions_hat) {
+            *dot = -settings.step_size * *hat;
+        }
+
+        // The tangent of the rollout along ȧ.
+        let (size, latents) = (rows * network.sizes.actions, rows * network.sizes.latent);
+        let x_dot = &mut x[..latents];
+        x_dot.fill(T::ZERO);
+        for (t, step) in steps.iter_mut().enumerate() {
+            network.jvp(rows, t == 0, step, &actions_dot[t * size..][..size], x_dot, buffers);
+        }
+
+        // The Huber loss has a second derivative, 1, where it is quadratic.
+        for (((x_hat, x_g_hat), x_dot), error) in x_hat.iter_mut().zip(x_g_hat).zip(x_dot).zip(goal_error) {
+            *x_hat = if huber_grad(*error) == *error { *x_dot } else { T::ZERO };
+            *x_g_hat -= *x_hat;
+        }
+    }
+
+    /// The way back along rollout k: from x̂_H to x̂_0, and to â before the update.
+    fn rollout_backward(
+        &mut self,
+        network: &PolicyDynamics<T>,
+        settings: Settings<T>,
+        rows: usize,
+        k: usize,
+        x_g_hat: &mut [T],
+        gradient: &mut PolicyDynamicsGradient<T>,
+    ) {
+        let Self { rollouts, buffers, actions_hat, x_hat, .. } = self;
+        let size = rows * network.sizes.actions;
+        let order = if settings.updates > 0 { Order::Second } else { Order::First };
+        for (t, step) in rollouts[k].steps.iter_mut().enumerate().rev() {
+            let branches = Branches {
+                // The first step's x does not move with the actions.
+                trunk: if t > 0 { order } else { Order::First },
+                dynamics: settings.is_state_needed(t).then_some(order),
+                policy: k == 0,
+            };
+            let mut hat = Cotangents {
+                x: &mut x_hat[..rows * network.sizes.latent],
+                x_g: x_g_hat,
+                action: &mut actions_hat[t * size..][..size],
+            };
+            network.double_backward(rows, branches, step, &mut hat, gradient, buffers);
+        }
+    }
+}
+
+impl<T> Settings<T> {
+    /// True if the next step or the inner loss depends on the state after step t.
+    fn is_state_needed(&self, t: usize) -> bool {
+        self.updates > 0 || t + 1 < self.horizon
+    }
+}

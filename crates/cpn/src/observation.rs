@@ -1,0 +1,43 @@
+//! Observations and goals: images or positions.
+
+use crate::{images, positions};
+use tch::Tensor;
+
+/// An observation or a goal.
+#[derive(Debug, Clone, Copy)]
+pub enum Observed<'a> {
+    /// RGB8, `[84, 84, 3]`.
+    Image(&'a [u8]),
+    /// x, y, z in metres.
+    Position([f32; 3]),
+}
+
+/// Several observations or goals of one kind.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Frames {
+    /// RGB8, `[F, 84, 84, 3]`.
+    Images(Vec<u8>),
+    /// x, y, z in metres, `[F, 3]`.
+    Positions(Vec<[f32; 3]>),
+}
+
+impl Frames {
+    /// The frames one by one, without the bytes after the last whole image.
+    pub fn observed(&self) -> Vec<Observed<'_>> {
+        match self {
+            Self::Images(bytes) => bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(),
+            Self::Positions(metres) => metres.iter().copied().map(Observed::Position).collect(),
+        }
+    }
+
+    /// All frames in one tensor, as [`Encoder::encode`](crate::encoder::Encoder::encode) takes them.
+    ///
+    /// # Panics
+    /// If the bytes are not a whole, non-zero number of images.
+    pub fn tensor(&self) -> Tensor {
+        match self {
+            Self::Images(bytes) => images::from_bytes(bytes).expect("whole images, and at least one"),
+            Self::Positions(metres) => positions::from_metres(metres),
+        }
+    }
+}
