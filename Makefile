@@ -15,7 +15,7 @@ PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tes
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench fuzz bench-sim bench-train bench-plan bench-stack lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -60,16 +60,16 @@ build: setup ## Compile the services
 	cargo build --release --locked
 
 demo: build ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
-	scripts/demo.sh
+	$(WORKER)/bin/python experiments/demo.py
 
 dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check them (EPISODES=n for fewer)
-	scripts/dataset.sh
+	$(WORKER)/bin/python experiments/dataset.py
 
 jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint errors, pokes, a picture of the trajectories
-	scripts/jenga.sh
+	$(WORKER)/bin/python experiments/jenga/run.py
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
-	scripts/models.sh
+	$(WORKER)/bin/python experiments/models.py
 
 sign-models: | $(UV) ## Sign the shipped checkpoints (KEY=private key in PEM), and write their public key
 	@test -f "$(KEY)" || { echo "KEY: expected a file with a private key in PEM, got \"$(KEY)\"" >&2; exit 1; }
@@ -141,6 +141,12 @@ bench-plan: build $(BENCH)/.ready ## Compare plans with PyTorch, JAX and ONNX Ru
 bench-stack: $(STACK)/.ready ## Measure the containers: throughput, start-up, recovery, the cost of mutual TLS (QUICK=1 for a glance)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
 	cd tests/stack && $(UV) run --quiet python -m cpn_stack.bench --out $(CURDIR)/runs/bench $(if $(QUICK),--quick)
+
+$(TOOLS)/bin/cargo-deny:
+	cargo install --quiet --locked --root $(TOOLS) cargo-deny@0.20.2
+
+deny: $(TOOLS)/bin/cargo-deny ## Check licences and sources of dependencies (advisories need GitHub: cargo deny check)
+	$(TOOLS)/bin/cargo-deny --locked check licenses bans sources
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check

@@ -1,10 +1,9 @@
 """The paper's rule: the horizon and the number of updates whose plans are predicted to end nearest to their targets.
 
-Measured on the trained starts and targets alone. Writes the table, and prints the chosen pair as "H U".
+Measured on the trained starts and targets alone.
 """
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,8 @@ from planning import Planner, along, demonstrations, network
 from cpn_sim_worker import keys
 
 
-def main(endpoint: str, planner_name: str, out: Path, episodes: list[str], models: list[str]) -> None:
-    """Each model is named `h<H>-u<U>`."""
+def choose(endpoint: str, planner_name: str, out: Path, episodes: list[str], models: list[str]) -> tuple[int, int]:
+    """Writes the table, and answers horizon and updates; each model is named `h<H>-u<U>`."""
     rows: list[dict[str, float]] = []
     with network(endpoint, keys.planner_alive(planner_name)) as session:
         recorded = demonstrations(session, episodes)
@@ -27,11 +26,7 @@ def main(endpoint: str, planner_name: str, out: Path, episodes: list[str], model
             ]
             deviation_cm = float(100 * np.linalg.norm(ends, axis=1).mean())
             rows.append({"horizon": horizon, "updates": updates, "deviation_cm": deviation_cm, "n": len(ends)})
-            print(f"H = {horizon:2}, U = {updates}: {deviation_cm:.2f} cm from the target", file=sys.stderr)
+            print(f"H = {horizon:2}, U = {updates}: {deviation_cm:.2f} cm from the target")
     best = min(rows, key=lambda row: row["deviation_cm"])
     out.write_text(json.dumps({"length": length, "grid": rows, "chosen": best}, indent=2) + "\n")
-    print(best["horizon"], best["updates"])
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], Path(sys.argv[3]), sys.argv[4].split(","), sys.argv[5:])
+    return int(best["horizon"]), int(best["updates"])

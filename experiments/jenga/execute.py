@@ -4,7 +4,7 @@ Five ways to move: CPN's trajectory, planned before the hand moves; the same of 
 planning anew at every step; the recorded actions of the nearest demonstration; a straight line of the fingertip, by
 inverse kinematics. Models are named `cpn-<seed>` and `hindsight-<seed>`.
 
-Each trial is a line of `trials.jsonl` as soon as it is done; a second run makes those that are missing.
+Each trial is a line of `trials.jsonl` as soon as it is done; a second run executes the missing ones.
 """
 
 import json
@@ -112,7 +112,7 @@ def done(path: Path) -> set[tuple[str, str, str, int]]:
     return {(trial["method"], trial["model"], trial["task"], trial["seed"]) for trial in trials}
 
 
-def main(
+def execute(
     endpoint: str, planner_name: str, folder: Path, episodes: list[str], workers: list[str], models: list[str]
 ) -> None:
     """Shares the trials between the workers, and writes them and the demonstrations to the folder."""
@@ -156,8 +156,3 @@ def main(
             failed = sum(pool.map(share, range(len(workers))))
     if failed:
         raise SystemExit(f"{failed} of {len(jobs)} trials failed; a second run makes them")
-
-
-if __name__ == "__main__":
-    lists = [argument.split(",") for argument in sys.argv[4:7]]
-    main(sys.argv[1], sys.argv[2], Path(sys.argv[3]), *lists)

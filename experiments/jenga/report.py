@@ -1,7 +1,6 @@
 """What the trials say: a table with intervals, paired differences, and a picture of the trajectories."""
 
 import json
-import sys
 from pathlib import Path
 
 import matplotlib as mpl
@@ -129,19 +128,15 @@ def draw(demonstrations: list[list[list[float]]], trials: Trials, path: Path) ->
     figure.savefig(path, dpi=110)
 
 
-def main(folder: Path) -> None:
-    """Reads what choose.py and execute.py left; writes report.json, report.md and trajectories.png beside."""
+def report(folder: Path) -> None:
+    """Writes report.json, report.md and trajectories.png beside the files of choose.py and execute.py."""
     demonstrations, grid = (json.loads((folder / f"{name}.json").read_text()) for name in ("demonstrations", "../grid"))
     # Two workers write as they come; the picture and the pairs want an order.
     lines = (folder / "trials.jsonl").read_text().splitlines()
     trials = sorted(map(measured, map(json.loads, lines)), key=lambda trial: trial["seed"])
     rows = summarise(trials)
-    report = {"command": "make jenga", "selection": grid, "rows": rows}
-    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    contents = {"command": "make jenga", "selection": grid, "rows": rows}
+    (folder / "report.json").write_text(json.dumps(contents, indent=2) + "\n")
     (folder / "report.md").write_text(table(rows))
     draw(demonstrations, trials, folder / "trajectories.png")
     print(table(rows))
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

@@ -290,7 +290,7 @@ fn a_payload_of_another_type_is_refused() {
 }
 
 #[test]
-fn one_signature_is_wanted() {
+fn more_than_one_signature_is_refused() {
     let payload = statement().to_string();
     let both = json!([signature(1, payload.as_bytes()), signature(2, payload.as_bytes())]);
     let bundle = bundle_of(payload.as_bytes(), both).to_string();

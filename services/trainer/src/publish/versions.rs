@@ -155,11 +155,11 @@ impl Versions {
     /// `NOT_FOUND` for an unknown model.
     pub fn list(&self, request: ListVersionsRequest) -> Result<ListVersionsResponse, Error> {
         let histories = self.histories();
-        let wanted: Vec<&History> = match request.model {
+        let histories: Vec<&History> = match request.model {
             Some(model) => vec![find(&histories, &model)?],
             None => histories.values().collect(),
         };
-        let versions = wanted.into_iter().flat_map(|history| {
+        let versions = histories.into_iter().flat_map(|history| {
             let kept = history.manifests().iter().filter(|manifest| self.is_there(manifest));
             kept.map(|manifest| {
                 let promoted = history.promoted()?.version == manifest.version;
