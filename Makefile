@@ -10,8 +10,6 @@ OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
 COMPOSE ?= docker-compose
-# The profile of the services, so that what `make demo` compiled is not compiled again.
-CARGO_TEST := cargo test --release --workspace --locked
 # All code in Python, as seen from sim-worker, whose settings hold for it.
 PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tests/kubernetes tests/openpi tests/stack)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
@@ -95,24 +93,24 @@ stack: ## Build the containers, evaluate in them, leave the report in runs/stack
 	exit "$$(docker wait "$$($(COMPOSE) ps --all --quiet evaluator)")"
 
 test: setup ## Everything that must pass
-	$(CARGO_TEST)
+	cargo test --workspace --locked
 	cd sim-worker && $(UV) run --quiet pytest
 
 test-crash: setup ## Kill the recorder a hundred times
-	$(CARGO_TEST) --test crash -- --ignored
+	cargo test --workspace --locked --test crash -- --ignored
 
 test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
-	$(CARGO_TEST) --test swap -- --ignored --nocapture
+	cargo test --workspace --locked --test swap -- --ignored --nocapture
 
 test-soak: setup ## Half an hour of everything at once against one planner: nothing fails, no memory grows
-	$(CARGO_TEST) --test soak -- --ignored --nocapture
+	cargo test --workspace --locked --test soak -- --ignored --nocapture
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
-	$(CARGO_TEST) --test openpi
-	cargo build --release --locked
+	cargo test --workspace --locked --test openpi
+	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)

@@ -18,7 +18,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
-PLANNER = os.environ.get("CPN_PLANNER", str(ROOT / "target/release/cpn-planner"))
+PLANNER = os.environ.get("CPN_PLANNER", str(ROOT / "target/debug/cpn-planner"))
 
 
 def _messages() -> dict[str, Any]:

@@ -14,7 +14,7 @@ from websockets.exceptions import InvalidStatus
 
 from conftest import MESSAGES, PLANNER, ROOT
 
-CERTS = os.environ.get("CPN_CERTS", str(ROOT / "target/release/cpn-certs"))
+CERTS = os.environ.get("CPN_CERTS", str(ROOT / "target/debug/cpn-certs"))
 
 
 @dataclass
