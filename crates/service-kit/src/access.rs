@@ -115,8 +115,8 @@ impl Access {
             Refusal::Forbidden => "forbidden",
         };
         let identity = identity.map_or("unknown", String::as_str);
-        warn!(client = %peer.address, identity, what, reason, "a client was refused");
         counter!("cpn_access_refused_total", "reason" => reason).increment(1);
+        warn!(client = %peer.address, identity, what, reason, "a client was refused");
         Err(refusal)
     }
 }

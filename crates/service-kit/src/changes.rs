@@ -20,10 +20,10 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// Logs and counts a change that was refused: who asked for it, as an address or a zenoh key, and why not.
+    /// Counts and logs a change that was refused: who asked for it, as an address or a zenoh key, and why not.
     pub fn refused(&self, change: &'static str, by: impl Display, why: impl Display) {
-        warn!(change, %by, %why, "a change was refused");
         counter!(self.metric, "change" => change).increment(1);
+        warn!(change, %by, %why, "a change was refused");
     }
 
     /// Does so for every refusal of the methods, with the peer's address and certificate, if it has shown one.

@@ -102,15 +102,15 @@ async fn accept(
         let (stream, address) = match listener.accept().await {
             Ok(accepted) => accepted,
             Err(error) => {
-                warn!(listener = name, %error, "a connection was not accepted");
                 count_refusal(name, "system");
+                warn!(listener = name, %error, "a connection was not accepted");
                 sleep(PAUSE).await;
                 continue;
             }
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            warn!(listener = name, client = %address, max_connections, "a connection was refused: all places are taken");
             count_refusal(name, "full");
+            warn!(listener = name, client = %address, max_connections, "a connection was refused: all places are taken");
             continue;
         };
         let (acceptor, sender) = (acceptor.clone(), sender.clone());
@@ -123,8 +123,8 @@ async fn accept(
                     let _ = sender.send(Connection { stream, peer, patience, last_read, _place: place }).await;
                 }
                 Err(error) => {
-                    warn!(listener = name, client = %address, %error, "a TLS handshake failed");
                     count_refusal(name, "handshake");
+                    warn!(listener = name, client = %address, %error, "a TLS handshake failed");
                 }
             }
         });
