@@ -15,7 +15,10 @@ fn the_readme_shows_one_example_and_links_the_others() {
     let readme = read("README.md");
     assert!(readme.contains(&read("examples/plan_zenoh.py")), "README.md: expected the text of examples/plan_zenoh.py");
     for file in ["examples/plan_grpc.py", "examples/plan_openpi.py", "services/planner/examples/plan.rs"] {
-        assert!(!read(file).is_empty() && readme.contains(&format!("]({file})")), "README.md: expected a link to {file}");
+        assert!(
+            !read(file).is_empty() && readme.contains(&format!("]({file})")),
+            "README.md: expected a link to {file}"
+        );
     }
 }
 
