@@ -54,7 +54,7 @@ where
 pub struct Sources(ArgMatches);
 
 impl Sources {
-    /// Those of the `settings` that were given, on the command line or in the environment variable of an option.
+    /// Given settings: those of `settings` on the command line or in the environment variable of an option.
     ///
     /// # Errors
     /// If the settings cannot be serialised.

@@ -25,7 +25,7 @@ struct Page<'a> {
     confidence: String,
     interval_method: &'a str,
     errors: usize,
-    /// What is said of seeds of demonstrations; empty for others.
+    /// Remark on seeds of demonstrations; empty for others.
     seeds_warning: &'a str,
     legend: Vec<LegendEntry<'a>>,
     /// Each task with its seeds.

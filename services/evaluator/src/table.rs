@@ -4,7 +4,7 @@ use crate::record::GoalSource;
 use crate::summary::{Row, Summary};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
 
-/// What is said of a run with seeds of demonstrations.
+/// Remark on a run with seeds of demonstrations.
 pub(crate) const DEMONSTRATION_SEEDS: &str = "not an evaluation: the seeds are those of demonstrations, so that models may have been trained on the very variations";
 
 /// The summary as a table, one row for each task and model, followed by what went wrong.

@@ -35,7 +35,7 @@ pub(crate) struct ModelThread {
     models: watch::Receiver<BTreeMap<String, ModelInfo>>,
 }
 
-/// What the thread has that owns the models.
+/// State of the thread that owns the models.
 struct Lead {
     owner: Owner,
     jobs: mpsc::Receiver<Job>,
@@ -275,7 +275,7 @@ impl Relay {
                 Step::Reply(reply, answer) if load.has_stuck() => reply.send(answer),
                 Step::Reply(reply, answer) => {
                     let number = load.begin_reply();
-                    // Who comes from now on sees it, and has it watched.
+                    // Requests from now on see it, and have it watched.
                     if load.tasks() > 0 || owner.has_outgoing() {
                         self.watch();
                     }
@@ -308,7 +308,7 @@ impl Relay {
                 let nothing_to_watch = || this.load.tasks() == 0 && this.load.replying().is_none();
                 if nothing_to_watch() {
                     this.is_watched.store(false, Ordering::SeqCst);
-                    // Who has come in the meantime is seen here, or sees that nobody watches.
+                    // Requests that came in the meantime are seen here, or see that nobody watches.
                     if nothing_to_watch() || this.is_watched.swap(true, Ordering::SeqCst) {
                         return;
                     }

@@ -39,7 +39,7 @@ pub(crate) struct Owner {
     outgoing: VecDeque<(Reply, Answer)>,
 }
 
-/// What is to be done next.
+/// Next thing to do.
 #[expect(
     clippy::large_enum_variant,
     reason = "it is taken apart where it is made, and a box would be allocated for each plan"
