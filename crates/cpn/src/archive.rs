@@ -1,58 +1,106 @@
 //! Named tensors and one JSON document in a safetensors file.
 
 use crate::unique;
-use safetensors::SafeTensors;
-use safetensors::tensor::{Dtype, TensorView};
+use bytemuck::Pod;
+use safetensors::tensor::TensorView;
+use safetensors::{SafeTensorError, SafeTensors};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::collections::{BTreeMap, HashMap};
-use tch::Tensor;
+
+pub use safetensors::Dtype;
 
 /// The one metadata key; its value is a JSON document.
 const METADATA_KEY: &str = "cpn";
-/// Longest header that is read, in bytes: to parse one takes many times as much memory.
+/// Maximum length of a header, in bytes: parsing it takes many times as much memory.
 const MAX_HEADER_BYTES: u64 = 1 << 20;
 
-/// Tensors by name, in the order they are written.
+/// Tensors by name, in the order of the file.
 pub type Tensors = BTreeMap<String, Tensor>;
+
+/// A tensor: type of its elements, shape, and elements in row-major order.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Tensor {
+    dtype: Dtype,
+    shape: Vec<usize>,
+    /// Elements in native byte order, which on supported machines is safetensors' little endian.
+    bytes: Vec<u8>,
+}
+
+/// Types of tensor elements.
+pub trait Scalar: Pod {
+    /// The type's name in safetensors.
+    const DTYPE: Dtype;
+}
+
+impl Scalar for f32 {
+    const DTYPE: Dtype = Dtype::F32;
+}
+
+impl Scalar for f64 {
+    const DTYPE: Dtype = Dtype::F64;
+}
+
+impl Scalar for i64 {
+    const DTYPE: Dtype = Dtype::I64;
+}
+
+impl Scalar for u8 {
+    const DTYPE: Dtype = Dtype::U8;
+}
+
+impl Tensor {
+    /// A tensor of these elements.
+    ///
+    /// # Panics
+    /// If their number is not that of the shape.
+    pub fn new<T: Scalar>(shape: &[usize], elements: &[T]) -> Self {
+        assert_eq!(shape.iter().product::<usize>(), elements.len(), "elements of a tensor of shape {shape:?}");
+        Self { dtype: T::DTYPE, shape: shape.to_vec(), bytes: bytemuck::cast_slice(elements).to_vec() }
+    }
+
+    /// Type of the elements.
+    pub fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    /// The shape; empty for a scalar.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// The elements, row by row; none if they are of another type.
+    pub fn elements<T: Scalar>(&self) -> Option<Vec<T>> {
+        (self.dtype == T::DTYPE).then(|| bytemuck::pod_collect_to_vec(&self.bytes))
+    }
+}
 
 /// Serialises tensors with a document about them. The same contents give the same bytes.
 ///
 /// # Errors
-/// If the document has no JSON form or a tensor's kind has none in safetensors.
+/// If the document has no JSON form.
 pub fn to_bytes<M: Serialize>(tensors: &Tensors, metadata: &M) -> Result<Vec<u8>, ArchiveError> {
     let json = serde_json::to_string(metadata).map_err(|e| ArchiveError(e.to_string()))?;
-    let raw = tensors
+    let views = tensors
         .iter()
-        .map(|(name, tensor)| {
-            let tensor = tensor.detach().contiguous();
-            let mut data = vec![0; tensor.numel() * tensor.kind().elt_size_in_bytes()];
-            tensor.f_copy_data_u8(&mut data, tensor.numel())?;
-            let shape: Vec<usize> = tensor.size().iter().map(|&n| n as usize).collect();
-            Ok((name, Dtype::try_from(tensor.kind())?, shape, data))
+        .map(|(name, Tensor { dtype, shape, bytes })| {
+            Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?))
         })
-        .collect::<Result<Vec<_>, tch::TchError>>()
-        .map_err(|e| ArchiveError(e.to_string()))?;
-    let views = raw
-        .iter()
-        .map(|(name, dtype, shape, data)| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), data)?)))
-        .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()
-        .map_err(|e| ArchiveError(e.to_string()))?;
-    safetensors::serialize(views, &Some(HashMap::from([(METADATA_KEY.to_owned(), json)])))
-        .map_err(|e| ArchiveError(e.to_string()))
+        .collect::<Result<Vec<_>, SafeTensorError>>()?;
+    Ok(safetensors::serialize(views, Some(HashMap::from([(METADATA_KEY.to_owned(), json)])))?)
 }
 
-/// Reads what [`to_bytes`] wrote.
+/// Reads the bytes of [`to_bytes`].
 ///
 /// # Errors
 /// If the file is truncated or malformed, its header is too long, or it lacks a valid document.
 pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), ArchiveError> {
     let header_bytes = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if header_bytes > MAX_HEADER_BYTES {
-        // Not how many: of a file that is none of these, that would be its first bytes.
+        // The number is left out: of a file of another kind it would be its first bytes.
         return Err(ArchiveError(format!("header: expected at most {MAX_HEADER_BYTES} bytes, got more")));
     }
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| ArchiveError(e.to_string()))?;
+    let (_, header) = SafeTensors::read_metadata(bytes)?;
     let json = header
         .metadata()
         .as_ref()
@@ -63,17 +111,22 @@ pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), Arc
     unique::check(header).map_err(|e| ArchiveError(format!("header: {e}")))?;
     unique::check(json.as_bytes()).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
     let document = serde_json::from_str(json).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
-    let file = SafeTensors::deserialize(bytes).map_err(|e| ArchiveError(e.to_string()))?;
-    let tensors = file
-        .tensors()
-        .into_iter()
-        .map(|(name, view)| Ok((name, Tensor::try_from(view)?)))
-        .collect::<Result<_, tch::TchError>>()
-        .map_err(|e| ArchiveError(e.to_string()))?;
-    Ok((tensors, document))
+    let file = SafeTensors::deserialize(bytes)?;
+    let tensor = |view: &TensorView<'_>| Tensor {
+        dtype: view.dtype(),
+        shape: view.shape().to_vec(),
+        bytes: view.data().to_vec(),
+    };
+    Ok((file.iter().map(|(name, view)| (name.to_owned(), tensor(&view))).collect(), document))
 }
 
 /// A safetensors file that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[error("safetensors: {0}")]
 pub struct ArchiveError(String);
+
+impl From<SafeTensorError> for ArchiveError {
+    fn from(error: SafeTensorError) -> Self {
+        Self(error.to_string())
+    }
+}

@@ -1,14 +1,13 @@
 //! Checkpoints: weights, with everything needed to rebuild and to trace the model in the file's metadata.
 
-use crate::agent::Agent;
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
+use crate::model::{self, Model, Parameter};
 use crate::recipe::Training;
 use crate::unique;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
-use tch::Kind;
 
 /// Largest checkpoint that is read, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
@@ -42,8 +41,8 @@ struct Metadata {
 /// A loaded model.
 #[derive(Debug)]
 pub struct Checkpoint {
-    /// The agent, its weights frozen.
-    pub agent: Agent,
+    /// Configuration and weights.
+    pub model: Model,
     /// Where it comes from.
     pub provenance: Provenance,
     /// SHA-256 of the checkpoint's bytes, in hex.
@@ -59,20 +58,20 @@ impl Checkpoint {
     }
 }
 
-/// Serialises an agent; the same weights give the same bytes.
+/// Serialises a model; the same weights give the same bytes.
 ///
 /// # Errors
 /// If the weights cannot be represented.
-pub fn to_bytes(agent: &Agent, provenance: &Provenance) -> Result<Vec<u8>, ArchiveError> {
-    let metadata = Metadata { format: FORMAT, model: agent.config().clone(), provenance: provenance.clone() };
-    archive::to_bytes(&agent.variables().variables().into_iter().collect(), &metadata)
+pub fn to_bytes(model: &Model, provenance: &Provenance) -> Result<Vec<u8>, ArchiveError> {
+    let metadata = Metadata { format: FORMAT, model: model.config.clone(), provenance: provenance.clone() };
+    archive::to_bytes(&model.weights, &metadata)
 }
 
 /// Rebuilds a model from a stranger's bytes.
 ///
 /// # Errors
 /// Says what is wrong with the file: size, format, configuration, or a tensor that is missing, unknown, of the wrong
-/// shape or kind, or not finite.
+/// shape or type, or not finite.
 pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     if bytes.len() > MAX_BYTES {
         return Err(CheckpointError::TooLarge { got: bytes.len() });
@@ -90,11 +89,10 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
         unique::check(render_spec.as_bytes()).map_err(CheckpointError::RenderSpec)?;
     }
     let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
-    let mut agent = Agent::new(metadata.model, 0);
-    copy_weights(&tensors, &agent)?;
-    agent.variables_mut().freeze();
+    check_weights(&tensors, &metadata.model)?;
+    let model = Model { config: metadata.model, weights: tensors };
     let (digest, config_digest) = (digest(bytes), digest(&config));
-    Ok(Checkpoint { agent, provenance: metadata.provenance, digest, config_digest })
+    Ok(Checkpoint { model, provenance: metadata.provenance, digest, config_digest })
 }
 
 /// SHA-256 of bytes, in hex: how checkpoints are named.
@@ -102,28 +100,26 @@ pub fn digest(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// Copies `tensors` over the agent's weights.
+/// Checks that tensors are the weights of a valid configuration.
 ///
 /// # Errors
-/// If they are not exactly the agent's weights in name, shape and kind, or not finite.
-pub fn copy_weights(tensors: &Tensors, agent: &Agent) -> Result<(), CheckpointError> {
-    let mut variables = agent.variables().variables();
-    if let Some(name) = tensors.keys().find(|name| !variables.contains_key(*name)) {
+/// If they are not exactly these in name, shape and type, or not finite.
+fn check_weights(tensors: &Tensors, config: &ModelConfig) -> Result<(), CheckpointError> {
+    let parameters = model::parameters(config);
+    let is_known = |name: &String| parameters.iter().any(|parameter| parameter.name == *name);
+    if let Some(name) = tensors.keys().find(|name| !is_known(name)) {
         return Err(CheckpointError::UnknownTensor { name: name.clone() });
     }
-    for (name, variable) in &mut variables {
-        let tensor = tensors.get(name).ok_or_else(|| CheckpointError::MissingTensor { name: name.clone() })?;
-        if tensor.kind() != Kind::Float || tensor.size() != variable.size() {
-            return Err(CheckpointError::Shape {
-                name: name.clone(),
-                expected: format!("Float{:?}", variable.size()),
-                got: format!("{:?}{:?}", tensor.kind(), tensor.size()),
-            });
+    for Parameter { name, shape, .. } in parameters {
+        let Some(tensor) = tensors.get(&name) else { return Err(CheckpointError::MissingTensor { name }) };
+        match tensor.elements::<f32>().filter(|_| tensor.shape() == shape) {
+            Some(elements) if elements.iter().all(|element| element.is_finite()) => {}
+            Some(_) => return Err(CheckpointError::NotFinite { name }),
+            None => {
+                let (expected, got) = (format!("F32{shape:?}"), format!("{:?}{:?}", tensor.dtype(), tensor.shape()));
+                return Err(CheckpointError::Shape { name, expected, got });
+            }
         }
-        if tensor.isfinite().all().int64_value(&[]) == 0 {
-            return Err(CheckpointError::NotFinite { name: name.clone() });
-        }
-        tch::no_grad(|| variable.copy_(tensor));
     }
     Ok(())
 }
@@ -167,14 +163,14 @@ pub enum CheckpointError {
         /// The tensor's name.
         name: String,
     },
-    /// A weight of another shape or kind.
+    /// A weight of another shape or type.
     #[error("checkpoint tensor \"{name}\": expected {expected}, got {got}")]
     Shape {
         /// The weight's name.
         name: String,
-        /// Kind and shape by the configuration.
+        /// Type and shape by the configuration.
         expected: String,
-        /// Kind and shape in the file.
+        /// Type and shape in the file.
         got: String,
     },
     /// A weight that is NaN or infinite.

@@ -1,10 +1,11 @@
-//! Contextual Planning Networks: the method itself, and nothing else.
+//! Contextual Planning Networks: the method in pure Rust.
 //!
-//! Visual goal-directed meta-learning with contextual planning networks (Rivera and Handelman, 2021) shows an agent one
-//! image of a finished task and plans towards it in a learned latent space. The files of this crate are the paper's
-//! ideas, one each: [`encoder`] (f_φ), [`neuromodulated`] (the layer with attenuated weights), [`dynamics`] (g_θ, the
-//! combined policy and dynamics), [`inner_loop`], [`loss`] (the outer loop); [`agent`] puts them together for each of the
-//! compared methods. [`engine`] does the same by hand-derived passes, without a graph: [`Planner`] serves an agent's plans, as a [`method`].
+//! Visual goal-directed meta-learning with contextual planning networks (Rivera and Handelman, 2021) shows an agent one image of a
+//! finished task and plans towards it in a learned latent space. A [`Model`] is the configuration and the weights of an image
+//! encoder f_φ and of g_θ, the combined policy and dynamics network; a [`Checkpoint`](checkpoint::Checkpoint) is a model with its
+//! provenance. An [`Engine`] computes with a model: its plans, as a [`Method`], and its training, as a [`Learner`]. The engine of
+//! this crate, [`engine::Native`], works by hand-derived passes on the processor; the crate `cpn-torch` has the reference by
+//! autograd, and an engine for every device of libtorch.
 //!
 //! | symbol | name here | meaning |
 //! |---|---|---|
@@ -17,30 +18,29 @@
 //! | x_t, x_g | `x`, `x_g` | their embeddings, `[B, Z]` |
 //! | â_{t:t+H} | `Plan::actions` | planned actions, `[B, H, A]` |
 //!
-//! Tensors are validated once, where bytes become tensors ([`images`], [`positions`], [`checkpoint`]); past that edge a wrong
-//! shape is a bug and `tch` panics.
+//! Files are validated once, where bytes become a model ([`checkpoint`]); past that edge a wrong shape is a bug and panics.
 
-pub mod agent;
 pub mod archive;
+mod batch;
 pub mod checkpoint;
 pub mod config;
-pub mod dynamics;
-pub mod encoder;
 pub mod engine;
 pub mod images;
-pub mod inner_loop;
-pub mod loss;
+pub mod learner;
 pub mod method;
-pub mod neuromodulated;
+pub mod model;
 mod observation;
 pub mod positions;
 mod precision;
 pub mod recipe;
-mod search;
+pub mod search;
 mod unique;
 
-pub use agent::Agent;
+pub use batch::Batch;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
-pub use engine::Planner;
+pub use engine::{Engine, Planner};
+pub use learner::Learner;
 pub use method::{Frames, Method, Plan, Random};
+pub use model::Model;
+pub use precision::Precision;
 pub use recipe::{Preset, Recipe, Training};

@@ -1,12 +1,12 @@
 //! The compared methods behind one interface (section "Methods for comparison").
 
 use crate::config::Input;
-use crate::engine::planning::ongoing::State;
+use crate::search::ongoing::State;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-pub use crate::engine::planning::ongoing::Ongoing;
 pub use crate::observation::{Frames, Observed};
+pub use crate::search::ongoing::Ongoing;
 pub use crate::search::{Iterations, Plan, Query, Search, Solver, rollouts};
 
 /// A method of control: from an observation and a goal to actions. Model predictive control applies the first action of each

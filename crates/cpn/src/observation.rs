@@ -1,7 +1,6 @@
 //! Observations and goals: images or positions.
 
-use crate::{images, positions};
-use tch::Tensor;
+use crate::images;
 
 /// An observation or a goal.
 #[derive(Debug, Clone, Copy)]
@@ -27,17 +26,6 @@ impl Frames {
         match self {
             Self::Images(bytes) => bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(),
             Self::Positions(metres) => metres.iter().copied().map(Observed::Position).collect(),
-        }
-    }
-
-    /// All frames in one tensor, as [`Encoder::encode`](crate::encoder::Encoder::encode) takes them.
-    ///
-    /// # Panics
-    /// If the bytes are not a whole, non-zero number of images.
-    pub fn tensor(&self) -> Tensor {
-        match self {
-            Self::Images(bytes) => images::from_bytes(bytes).expect("whole images, and at least one"),
-            Self::Positions(metres) => positions::from_metres(metres),
         }
     }
 }

@@ -2,14 +2,12 @@
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
-mod common;
-
-use common::{noise_images, position_config, small_config};
-use cpn::archive::{self, Tensors};
+use cpn::archive::{self, Tensor, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, MethodKind, positions};
+use cpn::{MethodKind, Model};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use testing::{position_config, small_config};
 
 fn provenance() -> Provenance {
     Provenance {
@@ -22,7 +20,7 @@ fn provenance() -> Provenance {
 }
 
 fn saved() -> Vec<u8> {
-    checkpoint::to_bytes(&Agent::new(small_config(MethodKind::Cpn), 5), &provenance()).unwrap()
+    checkpoint::to_bytes(&Model::new(small_config(MethodKind::Cpn), 5), &provenance()).unwrap()
 }
 
 /// The message of the refusal of a checkpoint that `spoil` has made wrong.
@@ -34,18 +32,13 @@ fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
 
 #[test]
 fn a_checkpoint_comes_back_whole() {
-    let (images, positions) = (noise_images(1, 1), positions::from_metres(&[[0.5, 0.1, 0.2]]));
-    let methods = MethodKind::ALL.into_iter();
-    for (config, input) in methods.flat_map(|m| [(small_config(m), &images), (position_config(m), &positions)]) {
-        let agent = Agent::new(config, 5);
-        let bytes = checkpoint::to_bytes(&agent, &provenance()).unwrap();
+    for config in MethodKind::ALL.into_iter().flat_map(|method| [small_config(method), position_config(method)]) {
+        let model = Model::new(config, 5);
+        let bytes = checkpoint::to_bytes(&model, &provenance()).unwrap();
         let loaded = checkpoint::from_bytes(&bytes).unwrap();
-        assert_eq!(loaded.agent.config(), agent.config());
+        assert_eq!(loaded.model, model);
         assert_eq!(loaded.provenance, provenance());
-        let x = agent.encode(input);
-        assert_eq!(loaded.agent.encode(input), x);
-        assert_eq!(loaded.agent.plan(&x, &x).actions, agent.plan(&x, &x).actions);
-        assert_eq!(checkpoint::to_bytes(&loaded.agent, &provenance()).unwrap(), bytes, "same weights, same bytes");
+        assert_eq!(checkpoint::to_bytes(&loaded.model, &provenance()).unwrap(), bytes, "same weights, same bytes");
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
         assert_eq!(loaded.parents(), ["d"]);
     }
@@ -53,16 +46,16 @@ fn a_checkpoint_comes_back_whole() {
 
 #[test]
 fn the_configuration_has_a_digest_of_its_own() {
-    let config = |agent: &Agent| {
-        checkpoint::from_bytes(&checkpoint::to_bytes(agent, &provenance()).unwrap()).unwrap().config_digest
+    let config = |model: &Model| {
+        checkpoint::from_bytes(&checkpoint::to_bytes(model, &provenance()).unwrap()).unwrap().config_digest
     };
     let (_, metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
-    let agent = Agent::new(small_config(MethodKind::Cpn), 5);
-    let json = serde_json::to_string(agent.config()).unwrap();
+    let model = Model::new(small_config(MethodKind::Cpn), 5);
+    let json = serde_json::to_string(&model.config).unwrap();
     assert_eq!(serde_json::from_str::<Value>(&json).unwrap(), metadata["model"]);
-    assert_eq!(config(&agent), checkpoint::digest(json.as_bytes()));
-    assert_eq!(config(&agent), config(&Agent::new(small_config(MethodKind::Cpn), 6)), "whatever the weights");
-    assert_ne!(config(&agent), config(&Agent::new(small_config(MethodKind::Upn), 5)));
+    assert_eq!(config(&model), checkpoint::digest(json.as_bytes()));
+    assert_eq!(config(&model), config(&Model::new(small_config(MethodKind::Cpn), 6)), "whatever the weights");
+    assert_ne!(config(&model), config(&Model::new(small_config(MethodKind::Upn), 5)));
 }
 
 #[test]
@@ -169,25 +162,25 @@ fn a_missing_weight_is_named() {
 
 #[test]
 fn an_unknown_weight_is_named() {
-    let message = refusal(|tensors, _| drop(tensors.insert("extra".into(), tch::Tensor::from(1.0f32))));
+    let message = refusal(|tensors, _| drop(tensors.insert("extra".into(), Tensor::new(&[], &[1.0f32]))));
     assert_eq!(message, "checkpoint tensor \"extra\": not part of the model's configuration");
 }
 
 #[test]
 fn a_wrong_shape_is_named() {
     let message = refusal(|_, metadata| metadata["model"]["hidden"] = json!(9));
-    assert!(message.contains("expected Float[") && message.contains("got Float["), "{message}");
+    assert!(message.contains("expected F32[") && message.contains("got F32["), "{message}");
 }
 
 #[test]
-fn a_wrong_kind_is_named() {
-    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), tch::Tensor::from(1.0f64))));
-    assert_eq!(message, "checkpoint tensor \"step_size\": expected Float[], got Double[]");
+fn a_wrong_type_is_named() {
+    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), Tensor::new(&[], &[1.0f64]))));
+    assert_eq!(message, "checkpoint tensor \"step_size\": expected F32[], got F64[]");
 }
 
 #[test]
 fn a_weight_that_is_not_a_number_is_named() {
-    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), tch::Tensor::from(f32::NAN))));
+    let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), Tensor::new(&[], &[f32::NAN]))));
     assert_eq!(message, "checkpoint tensor \"step_size\": expected finite values, got NaN or infinity");
 }
 
@@ -230,13 +223,9 @@ fn documented() -> BTreeMap<String, String> {
 fn the_page_lists_every_tensor_of_a_shipped_model() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/cpn.safetensors");
     let bytes = std::fs::read(path).unwrap();
-    let agent = checkpoint::from_bytes(&bytes).unwrap().agent;
-    let mut shipped: BTreeMap<_, _> = agent
-        .variables()
-        .variables()
-        .into_iter()
-        .map(|(name, tensor)| (name, format!("{:?}", tensor.size())))
-        .collect();
+    let model = checkpoint::from_bytes(&bytes).unwrap().model;
+    let shapes = model.weights.iter().map(|(name, tensor)| (name.clone(), format!("{:?}", tensor.shape())));
+    let mut shipped: BTreeMap<_, _> = shapes.collect();
     let documented = documented();
     assert!(documented.len() > 20, "{documented:?}");
     for (name, shape) in &documented {

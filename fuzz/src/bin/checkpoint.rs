@@ -5,12 +5,12 @@
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, CheckpointError, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, Training};
+use cpn::{EncoderConfig, MethodKind, Model, ModelConfig, Training};
 use libfuzzer_sys::fuzz_target;
 use serde_json::Value;
 use std::sync::LazyLock;
 
-fuzz_target!(init: { tch::set_num_threads(1); fuzz::seed("checkpoint", inputs(), check) }, |input: &[u8]| {
+fuzz_target!(init: { fuzz::seed("checkpoint", inputs(), check) }, |input: &[u8]| {
     let _ = check(input);
 });
 
@@ -36,7 +36,7 @@ fn check_file(file: &[u8]) -> Result<(), CheckpointError> {
     assert_eq!(archive::to_bytes(&same, &document).expect("what was read can be written"), copy);
 
     let read = checkpoint::from_bytes(file)?;
-    let copy = checkpoint::to_bytes(&read.agent, &read.provenance).expect("what was read can be written");
+    let copy = checkpoint::to_bytes(&read.model, &read.provenance).expect("what was read can be written");
     let same = checkpoint::from_bytes(&copy).expect("what was written can be read");
     assert_eq!((same.provenance, same.config_digest), (read.provenance, read.config_digest));
     Ok(())
@@ -68,7 +68,7 @@ fn example(method: MethodKind, encoder: EncoderConfig) -> Vec<u8> {
         seed: 5,
         training: Training::paper(),
     };
-    checkpoint::to_bytes(&Agent::new(config, 5), &provenance).expect("a checkpoint")
+    checkpoint::to_bytes(&Model::new(config, 5), &provenance).expect("a checkpoint")
 }
 
 fn inputs() -> Vec<Vec<u8>> {

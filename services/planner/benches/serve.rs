@@ -4,9 +4,8 @@
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
 use clap::Parser;
-use cpn::encoder::Precision;
 use cpn::method::{Iterations, Observed, Query, Solver};
-use cpn::{Method, checkpoint};
+use cpn::{Method, Precision, checkpoint};
 use futures::future::join_all;
 use planner::core::PlannerCore;
 use serde_json::{Value, json};

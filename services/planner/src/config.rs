@@ -1,7 +1,8 @@
 //! Settings of the planner.
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use cpn::encoder::Precision;
+use cpn::Precision;
+use engines::{Device, EngineKind};
 use serde::{Deserialize, Deserializer, Serialize};
 use service_kit::{SessionConfig, config};
 use signing::Trust;
@@ -44,10 +45,17 @@ pub struct Config {
     /// Batching delay, in milliseconds.
     #[arg(long, value_name = "MS", default_value = "0")]
     pub batch_delay_ms: u16,
-    /// Number of threads that compute a batch.
+    /// Engine that computes plans [default: native on the CPU, torch on a CUDA device].
+    #[arg(long, value_parser = named::<EngineKind>(&["native", "torch"]))]
+    pub engine: Option<EngineKind>,
+    /// Device that computes plans: cpu, cuda or cuda:N.
+    #[arg(long, default_value_t)]
+    pub device: Device,
+    /// Number of threads that compute a batch on the CPU.
     #[arg(long, value_name = "COUNT", default_value = "1")]
     pub threads: NonZeroU16,
-    /// Precision of the image encoder's products. bfloat16 is faster where the processor has AVX512-BF16, and float32 elsewhere.
+    /// Precision of the image encoder's products. bfloat16 is faster where the processor has AVX512-BF16, and float32 elsewhere
+    /// and with the engine torch.
     #[arg(long, default_value = "float32", value_parser = named::<Precision>(&["float32", "bfloat16"]))]
     pub precision: Precision,
     /// Policy towards checkpoints without a signature by a trusted key [default: warn if there are trusted keys, else off].

@@ -44,7 +44,8 @@ impl PlannerCore {
     /// # Errors
     /// Names the first checkpoint that cannot be loaded or is not signed as it must be, and why; or a file of keys.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
-        let computing = Computing { precision: config.precision.where_faster(), threads: config.threads };
+        let engine = engines::build(config.engine, config.device, config.threads.get().into())?;
+        let computing = Computing { engine, precision: config.precision.where_faster() };
         if computing.precision != config.precision {
             warn!(
                 "precision: expected a processor with instructions for bfloat16 (AVX512-BF16), got none; embedding in float32"
@@ -52,7 +53,8 @@ impl PlannerCore {
         }
         let signatures = Arc::new(Signatures::new(config)?);
         let (folder, checked) = (config.models_dir.clone(), Arc::clone(&signatures));
-        let models = tokio::task::spawn_blocking(move || load_all(&folder, &checked, computing)).await??;
+        let used = computing.clone();
+        let models = tokio::task::spawn_blocking(move || load_all(&folder, &checked, &used)).await??;
         let (capacity, got) = (usize::from(config.model_capacity.get()), models.len());
         ensure!(got <= capacity, "model_capacity: expected room for the {got} models that are there, got {capacity}");
         for Model { info, .. } in &models {
@@ -154,8 +156,8 @@ impl PlannerCore {
             Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{MAX_LOADS} checkpoints loading"))
         })?;
         let (folder, signatures) = (Arc::clone(&self.models_dir), Arc::clone(&self.signatures));
-        let computing = self.computing;
-        let load = move || Model::load(&folder, request, &signatures, computing);
+        let computing = self.computing.clone();
+        let load = move || Model::load(&folder, request, &signatures, &computing);
         Ok(LoadModelResponse { model: self.swap_in(load).await? })
     }
 
@@ -177,8 +179,8 @@ impl PlannerCore {
         let bytes = fetch.await?;
         // It comes once and unasked, so that it waits where a client would be sent away.
         let _load = self.loads.acquire().await;
-        let computing = self.computing;
-        self.swap_in(move || Model::published(manifest, &bytes, computing)).await.map(drop)
+        let computing = self.computing.clone();
+        self.swap_in(move || Model::published(manifest, &bytes, &computing)).await.map(drop)
     }
 
     /// Serves a model no longer. Searches that go on with it are finished; who names one of its checkpoints gets none.
@@ -235,7 +237,7 @@ impl PlannerCore {
 }
 
 /// `random` and every checkpoint in `folder`.
-fn load_all(folder: &Path, signatures: &Signatures, computing: Computing) -> anyhow::Result<Vec<Model>> {
+fn load_all(folder: &Path, signatures: &Signatures, computing: &Computing) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
     for path in checkpoints(folder)? {
         let loaded = load_file(folder, &path, signatures, computing);
@@ -257,7 +259,7 @@ fn checkpoints(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-fn load_file(folder: &Path, path: &Path, signatures: &Signatures, computing: Computing) -> Result<Model, Error> {
+fn load_file(folder: &Path, path: &Path, signatures: &Signatures, computing: &Computing) -> Result<Model, Error> {
     let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let source = CheckpointSource::File(text(path.file_name()));
     let request = LoadModelRequest { model: text(path.file_stem()), source };

@@ -4,14 +4,13 @@ use crate::load::{Costs, resolve};
 use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask};
 use cpn::checkpoint::{self, Checkpoint, Provenance};
-use cpn::encoder::Precision;
 use cpn::method::{self, Iterations, Observed, Ongoing, Query, Solver};
-use cpn::{Input, Method, Plan, Planner, Random, images};
+use cpn::{Engine, Input, Method, Plan, Precision, Random, images};
 use service_kit::files;
 use std::fmt;
 use std::io;
-use std::num::NonZeroU16;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 use wire::checkpoint::CheckpointManifest;
 use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo, PlanResponse, Search, StageTimes};
@@ -24,11 +23,11 @@ const RANDOM_ACTIONS: usize = 4;
 /// Plans that are tried to see what that costs.
 const TRIALS: usize = 32;
 
-/// What models compute with.
-#[derive(Debug, Clone, Copy)]
+/// Engine of all models, with the precision of their image encoders.
+#[derive(Debug, Clone)]
 pub(crate) struct Computing {
+    pub(crate) engine: Arc<dyn Engine>,
     pub(crate) precision: Precision,
-    pub(crate) threads: NonZeroU16,
 }
 
 /// A method with the name and digest it is served under.
@@ -66,7 +65,7 @@ impl Model {
         folder: &Path,
         request: LoadModelRequest,
         signatures: &Signatures,
-        computing: Computing,
+        computing: &Computing,
     ) -> Result<Self, Error> {
         let bytes = match request.source {
             CheckpointSource::Bytes(bytes) => {
@@ -91,7 +90,7 @@ impl Model {
     ///
     /// # Errors
     /// If they are not, with the manifest's field, or for anything wrong with the checkpoint.
-    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], computing: Computing) -> Result<Self, Error> {
+    pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], computing: &Computing) -> Result<Self, Error> {
         let CheckpointManifest { model, version, digest, config_digest, .. } = manifest;
         let got = checkpoint::digest(bytes);
         if got != digest {
@@ -105,10 +104,11 @@ impl Model {
     }
 
     /// What a checkpoint holds, once it has planned.
-    fn tried(name: String, version: u32, loaded: Checkpoint, computing: Computing) -> Result<Self, Error> {
+    fn tried(name: String, version: u32, loaded: Checkpoint, computing: &Computing) -> Result<Self, Error> {
         let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
-        let threads = usize::from(computing.threads.get());
-        let method: Box<dyn Method> = Box::new(Planner::new(loaded.agent, computing.precision, threads));
+        let method = computing.engine.planner(&loaded.model, computing.precision);
+        let method =
+            method.map_err(|e| Error::new(Code::Internal, "checkpoint", "a model that the device holds", e))?;
         let info = info(name, version, &*method, loaded.digest, training_tasks);
         let mut model = Self::new(info, render_spec, method);
         model.warm_up()?;

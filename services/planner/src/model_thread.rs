@@ -66,7 +66,6 @@ impl ModelThread {
         let relay = Relay {
             lead: Arc::new(Mutex::new(Some(Lead { owner, jobs: receiver }))),
             load: Arc::clone(&load),
-            threads: config.threads.get(),
             runtime: Handle::current(),
             is_watched: Arc::default(),
         };
@@ -243,7 +242,6 @@ impl fmt::Debug for Lead {
 struct Relay {
     lead: Arc<Mutex<Option<Lead>>>,
     load: Arc<Load>,
-    threads: u16,
     runtime: Handle,
     is_watched: Arc<AtomicBool>,
 }
@@ -253,7 +251,6 @@ impl Relay {
     fn spawn(&self, takes_over: impl FnOnce(&Load) -> bool + Send + 'static) -> io::Result<()> {
         let this = self.clone();
         thread::Builder::new().name("model".into()).spawn(move || {
-            tch::set_num_threads(this.threads.into());
             if takes_over(&this.load) {
                 this.work();
             }

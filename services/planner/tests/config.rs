@@ -27,7 +27,7 @@ fn a_default_does_not_win_over_the_file() {
     let file = "queue_capacity = 7\nprecision = 'bfloat16'\ngrpc_listen = '127.0.0.1:1'";
     let config = load(file, &["--queue-capacity", "64"]).unwrap();
     assert_eq!((config.queue_capacity.get(), config.grpc_listen.port()), (64, 1));
-    assert_eq!(config.precision, cpn::encoder::Precision::Bfloat16);
+    assert_eq!(config.precision, cpn::Precision::Bfloat16);
 }
 
 #[test]

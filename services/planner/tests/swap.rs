@@ -6,7 +6,7 @@ mod common;
 
 use common::{Client, Fixture, checkpoint, from_bytes, from_file, is, plan_request, soon};
 use cpn::MethodKind;
-use cpn::archive::{self, Tensors};
+use cpn::archive::{self, Tensor, Tensors};
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -34,17 +34,19 @@ async fn a_faulty_checkpoint_changes_nothing() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let truncated = cpn(2)[..1000].to_vec();
     let wrong_shape = spoiled(|_, metadata| metadata["model"]["hidden"] = 9.into());
-    let not_a_number = spoiled(|tensors, _| drop(tensors.insert("step_size".into(), f32::NAN.into())));
+    let not_a_number = spoiled(|tensors, _| drop(tensors.insert("step_size".into(), Tensor::new(&[], &[f32::NAN]))));
     // Every weight is finite, the embedding of a white image is not.
     let overflowing = spoiled(|tensors, _| {
         let weight = tensors.iter_mut().find(|(name, _)| name.starts_with("encoder.") && name.ends_with("weight"));
-        let _ = weight.unwrap().1.fill_(f64::from(f32::MAX));
+        let weight = weight.unwrap().1;
+        let count = weight.shape().iter().product();
+        *weight = Tensor::new(weight.shape(), &vec![f32::MAX; count]);
     });
     for client in fixture.clients() {
         let before = client.digest("cpn").await;
         for (checkpoint, reason) in [
             (&truncated, "safetensors"),
-            (&wrong_shape, "expected Float["),
+            (&wrong_shape, "expected F32["),
             (&not_a_number, "\"step_size\": expected finite values"),
             (&overflowing, "expected finite numbers"),
         ] {
@@ -277,7 +279,7 @@ async fn an_announced_checkpoint_is_fetched() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let [client, ..] = fixture.clients();
     // Larger than one piece.
-    let large = cpn::Agent::new(cpn::ModelConfig::paper(MethodKind::TeBc), 4);
+    let large = cpn::Model::new(cpn::ModelConfig::paper(MethodKind::TeBc), 4);
     let provenance = cpn::checkpoint::Provenance {
         training_tasks: vec![],
         data_digest: "d".repeat(64),

@@ -9,18 +9,17 @@
 mod common;
 
 use clap::Parser;
-use cpn::archive::{self, Tensors};
-use cpn::encoder::Precision;
-use cpn::{Frames, Input, MethodKind, ModelConfig, Preset, Recipe, Training, checkpoint, images};
+use cpn::archive::{self, Tensor, Tensors};
+use cpn::learner::StageTimes;
+use cpn::{Frames, Input, MethodKind, Model, ModelConfig, Precision, Preset, Recipe, Training, images};
+use engines::{Device, EngineKind};
 use serde_json::json;
 use std::io::{self, BufRead};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::thread;
 use std::time::Instant;
-use tch::Tensor;
 use trainer::training::dataset::Dataset;
-use trainer::training::learner::{Learner, StageTimes};
 use trainer::training::sampler::Sampler;
 
 /// Distinct batches, over and over.
@@ -41,6 +40,12 @@ struct Args {
     write_batches: Option<PathBuf>,
     #[arg(long)]
     method: String,
+    /// Engine that trains.
+    #[arg(long, value_enum, default_value = "native")]
+    engine: EngineKind,
+    /// Device that trains.
+    #[arg(long, default_value_t)]
+    device: Device,
     #[arg(long, default_value_t = 1)]
     threads: usize,
     #[arg(long)]
@@ -60,7 +65,7 @@ fn main() {
     let args = Args::parse();
     match (&args.write_batches, &args.batches) {
         (Some(path), _) => write(path, &args),
-        (None, Some(path)) => train(path, args.threads),
+        (None, Some(path)) => train(path, &args),
         (None, None) => unreachable!("clap wants one"),
     }
 }
@@ -99,19 +104,23 @@ fn write(path: &Path, args: &Args) {
     let index = |step: fn(&trainer::training::sampler::Sample) -> u32| {
         let frame = |sample| dataset.episodes()[sample_episode(sample)].first_frame + step(sample) as usize;
         let indices: Vec<i64> = samples.iter().map(|sample| frame(sample) as i64).collect();
-        Tensor::from_slice(&indices).view([BATCHES as i64, -1])
+        Tensor::new(&[BATCHES, recipe.training.batch_size], &indices)
     };
+    let (horizon, actions) = (recipe.model.horizon as usize, recipe.model.actions as usize);
     let made: Vec<_> = samples.chunks(recipe.training.batch_size).map(|samples| sampler.batch(0, samples)).collect();
-    let stack = |part: fn(&cpn::loss::Batch) -> &Tensor| Tensor::stack(&made.iter().map(part).collect::<Vec<_>>(), 0);
+    let stack = |shape: &[usize], part: fn(&cpn::Batch) -> &Vec<f32>| {
+        let shape = [&[BATCHES, recipe.training.batch_size, horizon], shape].concat();
+        Tensor::new(&shape, &made.iter().flat_map(part).copied().collect::<Vec<f32>>())
+    };
+    let size = images::SIZE as usize;
     let mut tensors = Tensors::from([
-        ("frames".to_owned(), images::from_bytes(pixels).unwrap()),
+        ("frames".to_owned(), Tensor::new(&[pixels.len() / images::BYTES, size, size, 3], pixels)),
         ("observation_index".to_owned(), index(|sample| sample.step)),
         ("goal_index".to_owned(), index(|sample| sample.goal)),
-        ("actions".to_owned(), stack(|batch| &batch.actions)),
-        ("mask".to_owned(), stack(|batch| &batch.mask)),
+        ("actions".to_owned(), stack(&[actions], |batch| &batch.actions)),
+        ("mask".to_owned(), stack(&[], |batch| &batch.mask)),
     ]);
-    let learner = Learner::new(&recipe, SEED, 1);
-    let weights = learner.agent.variables().variables().into_iter();
+    let weights = Model::new(recipe.model.clone(), SEED).weights.into_iter();
     tensors.extend(weights.map(|(name, weight)| (format!("weight.{name}"), weight)));
     std::fs::write(path, archive::to_bytes(&tensors, &recipe.model).unwrap()).unwrap();
     std::fs::write(path.with_extension("recipe.json"), serde_json::to_string(&recipe).unwrap()).unwrap();
@@ -121,8 +130,8 @@ fn sample_episode(sample: &trainer::training::sampler::Sample) -> usize {
     sample.episode as usize
 }
 
-fn train(path: &Path, threads: usize) {
-    tch::set_num_threads(threads as i32);
+fn train(path: &Path, args: &Args) {
+    let engine = engines::build(Some(args.engine), args.device, args.threads).unwrap();
     let recipe: Recipe =
         serde_json::from_str(&std::fs::read_to_string(path.with_extension("recipe.json")).unwrap()).unwrap();
     let (tensors, _): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
@@ -130,9 +139,8 @@ fn train(path: &Path, threads: usize) {
         tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t))).collect();
     let learner = |precision| {
         let training = Training { precision, ..recipe.training.clone() };
-        let learner = Learner::new(&Recipe { model: recipe.model.clone(), training }, SEED, threads);
-        checkpoint::copy_weights(&weights, &learner.agent).unwrap();
-        learner
+        let model = Model { config: recipe.model.clone(), weights: weights.clone() };
+        engine.learner(model, &training).unwrap()
     };
     let dataset = Dataset::load(&recordings(path), &[], Input::Image).unwrap();
     let sampler = Sampler::new(&dataset, &recipe, SEED);
@@ -168,11 +176,11 @@ fn train(path: &Path, threads: usize) {
             }
             let (count, started, mut loss) = (line.trim().parse().unwrap(), Instant::now(), f64::NAN);
             for batch in batches.iter().take(count) {
-                let learnt = learner.step(&batch, LEARNING_RATE).unwrap();
-                loss = learnt.loss;
-                stages.encoder_seconds += learnt.times.encoder_seconds;
-                stages.outer_loop_seconds += learnt.times.outer_loop_seconds;
-                stages.optimiser_seconds += learnt.times.optimiser_seconds;
+                let step = learner.step(&batch, LEARNING_RATE).unwrap();
+                loss = step.loss;
+                stages.encoder_seconds += step.times.encoder_seconds;
+                stages.outer_loop_seconds += step.times.outer_loop_seconds;
+                stages.optimiser_seconds += step.times.optimiser_seconds;
             }
             steps += count as u32;
             println!("{}", json!({"seconds": started.elapsed().as_secs_f64(), "loss": loss}));

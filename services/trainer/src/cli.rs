@@ -1,6 +1,7 @@
 //! The command line.
 
 use clap::{Args, Parser, Subcommand};
+use engines::{Device, EngineKind};
 use serde::Serialize;
 use service_kit::SessionConfig;
 use std::path::PathBuf;
@@ -81,6 +82,14 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     seed: Option<u64>,
+    /// Engine that computes: native or torch [default: native on the CPU, torch on a CUDA device].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    engine: Option<EngineKind>,
+    /// Device that computes: cpu, cuda or cuda:N [default: cpu].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    device: Option<Device>,
     /// Number of threads [default: 1].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]

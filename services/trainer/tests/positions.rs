@@ -5,11 +5,11 @@
 mod common;
 
 use common::{episode, info, keep, steps};
+use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::recipe::GoalSampling;
-use cpn::{Agent, Frames, Input, ModelConfig, Preset, Recipe, Training, checkpoint, positions};
+use cpn::{Frames, Input, Method, Model, ModelConfig, Planner, Precision, Preset, Recipe, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
-use tch::Tensor;
 use trainer::training::config::Config;
 use trainer::training::dataset::Dataset;
 use trainer::training::progress::StopIf;
@@ -55,13 +55,15 @@ fn distance(hand: [f32; 3]) -> f32 {
     hand.iter().zip(GOAL).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
 }
 
-/// Where the hand is predicted to be after plan upon plan.
-fn end(agent: &Agent, mut hand: [f32; 3]) -> [f32; 3] {
-    let x_g = agent.encode(&positions::from_metres(&[GOAL]));
+/// Position of the hand after [`ACTIONS`] first actions of plans.
+fn end(model: &Model, mut hand: [f32; 3]) -> [f32; 3] {
+    let mut planner = Planner::new(model, Precision::Float32, 1);
     for _ in 0..ACTIONS {
-        let plan = agent.plan(&agent.encode(&positions::from_metres(&[hand])), &x_g);
-        let action: Vec<f32> = Vec::try_from(plan.actions.select(1, 0).flatten(0, -1).clamp(-1.0, 1.0)).unwrap();
-        hand = [0, 1, 2].map(|axis| hand[axis] + action[axis] / 100.0);
+        let ends = planner.encode(&[Observed::Position(hand), Observed::Position(GOAL)]);
+        let query = Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] };
+        let iterations = Iterations::Fixed(model.config.updates as usize);
+        let plans = planner.plan(&[query], &mut Search { solver: Solver::Gradient, iterations });
+        hand = [0, 1, 2].map(|axis| hand[axis] + plans[0].actions[0][axis].clamp(-1.0, 1.0) / 100.0);
     }
     hand
 }
@@ -73,9 +75,9 @@ fn a_model_of_positions_learns_where_to_go() {
     let outcome = run::run(&config, &mut StopIf(|_| false)).unwrap();
     assert!(matches!(outcome, Outcome::Finished { .. }));
     let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
-    assert_eq!((loaded.agent.config(), loaded.provenance.render_spec.as_str()), (&config.model, ""));
+    assert_eq!((&loaded.model.config, loaded.provenance.render_spec.as_str()), (&config.model, ""));
     let start = [0.64, 0.01, 0.2];
-    let (before, after) = (distance(start), distance(end(&loaded.agent, start)));
+    let (before, after) = (distance(start), distance(end(&loaded.model, start)));
     assert!(after < before / 3.0, "{after} m from the goal, {before} m at the start");
 }
 
@@ -94,7 +96,7 @@ fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() 
         assert_eq!(samples.len(), STARTS.len() * ACTIONS as usize);
         assert_eq!(samples.iter().all(|sample| sample.goal == ACTIONS), goals == GoalSampling::Final);
         for (row, sample) in samples.iter().enumerate() {
-            let at = |index: &Tensor| frames[index.int64_value(&[row as i64]) as usize];
+            let at = |index: &[usize]| frames[index[row]];
             let start = STARTS[sample.episode as usize];
             assert_eq!(at(&batch.observations), hand(start, sample.step));
             let expected = if sample.goal == ACTIONS { GOAL } else { hand(start, sample.goal) };

@@ -9,7 +9,6 @@ use cpn::method::Observed;
 use cpn::recipe::GoalSampling;
 use cpn::{Input, ModelConfig, Preset, Recipe, Training};
 use std::collections::{BTreeMap, BTreeSet};
-use tch::Tensor;
 use trainer::training::dataset::Dataset;
 use trainer::training::sampler::{Sample, Sampler};
 
@@ -28,10 +27,6 @@ fn recipe(change: impl FnOnce(&mut Training)) -> Recipe {
     let mut recipe = Preset::PaperCpn.recipe();
     change(&mut recipe.training);
     recipe
-}
-
-fn floats(tensor: &Tensor) -> Vec<f32> {
-    Vec::try_from(tensor.flatten(0, -1)).unwrap()
 }
 
 #[test]
@@ -83,13 +78,11 @@ fn a_batch_is_what_was_recorded() {
         let frames = batch.frames.observed();
         let distinct: BTreeSet<_> = samples.iter().flat_map(|s| [(s.episode, s.step), (s.episode, s.goal)]).collect();
         assert_eq!(frames.len(), distinct.len(), "each frame once");
-        let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
+        let (actions, mask) = (&batch.actions, &batch.mask);
         for (row, s) in samples.iter().enumerate() {
             let recorded = |number| step("reach", s.episode.into(), STEPS[s.episode as usize], number);
             for (index, number) in [(&batch.observations, s.step), (&batch.goals, s.goal)] {
-                let Observed::Image(pixels) = frames[index.int64_value(&[row as i64]) as usize] else {
-                    panic!("an image")
-                };
+                let Observed::Image(pixels) = frames[index[row]] else { panic!("an image") };
                 assert_eq!(pixels, recorded(number).frame.data());
             }
             for t in 0..horizon {
@@ -131,7 +124,7 @@ fn batches_go_on_from_any_step() {
     let sampler = Sampler::new(&dataset, &recipe, 3);
     let per_epoch = sampler.steps_per_epoch() as usize;
     let all: Vec<_> = sampler.batches(0).take(3 * per_epoch).collect();
-    assert_eq!(all.iter().map(|b| b.observations.size()[0]).sum::<i64>(), 3 * dataset.sample_count() as i64);
+    assert_eq!(all.iter().map(|b| b.observations.len()).sum::<usize>(), 3 * dataset.sample_count());
     for start in [1, per_epoch, per_epoch + 2] {
         let later = sampler.batches(start as u64).next().unwrap();
         assert_eq!((&later.frames, &later.actions), (&all[start].frames, &all[start].actions));

@@ -5,8 +5,9 @@
 mod common;
 
 use common::{SPEC, episode, info, keep, steps};
+use cpn::engine::OuterLoss;
 use cpn::recipe::GoalSampling;
-use cpn::{Input, MethodKind, ModelConfig, Preset, Training, checkpoint};
+use cpn::{Input, MethodKind, ModelConfig, Precision, Preset, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
 use trainer::training::config::Config;
@@ -121,7 +122,7 @@ fn the_checkpoint_tells_where_it_comes_from() {
         let digest = finished(&config);
         let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
         assert_eq!(loaded.digest, digest);
-        assert_eq!(loaded.agent.config().method, method);
+        assert_eq!(loaded.model.config.method, method);
         assert_eq!(loaded.provenance.training_tasks, ["reach"]);
         assert_eq!((loaded.provenance.seed, &loaded.provenance.training), (4, &config.training));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
@@ -167,12 +168,12 @@ fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
     let base = config(folder.path(), "short");
     let loss_of = |path: &Path| {
-        let mut agent = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent;
-        agent.variables_mut().unfreeze();
+        let model = checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().model;
         let dataset = Dataset::load(&base.dataset, &[], Input::Image).unwrap();
         let recipe = base.recipe();
         let sampler = Sampler::new(&dataset, &recipe, 0);
-        agent.outer_loss(&sampler.batch(0, &sampler.epoch(0))).double_value(&[])
+        let batch = sampler.batch(0, &sampler.epoch(0));
+        OuterLoss::new(&model.config, Precision::Float32, 1).differentiate(&model.weights, &batch).loss
     };
     finished(&quick(base.clone(), 1, 50));
     let before = loss_of(&base.out);

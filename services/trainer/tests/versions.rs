@@ -7,7 +7,7 @@ mod common;
 mod signed;
 
 use common::checkpoint;
-use cpn::archive::{self, Tensors};
+use cpn::archive::{self, Tensor, Tensors};
 use signed::bundle;
 use std::collections::BTreeSet;
 use std::num::NonZeroU16;
@@ -324,13 +324,13 @@ fn faulty_checkpoints_are_refused_and_leave_nothing() {
     metadata["model"]["hidden"] = 9.into();
     let mismatched = archive::to_bytes(&tensors, &metadata).unwrap();
     metadata["model"]["hidden"] = 5.into();
-    tensors.insert("network.trunk.bias".into(), tch::Tensor::from(f32::NAN));
+    tensors.insert("network.trunk.bias".into(), Tensor::new(&[], &[f32::NAN]));
     let misshapen = archive::to_bytes(&tensors, &metadata).unwrap();
     for (bytes, reason) in [
         (&good[..good.len() - 1], "safetensors"),
         (&[], "safetensors"),
         (&vec![0; cpn::checkpoint::MAX_BYTES + 1], "expected at most 67108864 bytes, got 67108865"),
-        (&mismatched, "expected Float["),
+        (&mismatched, "expected F32["),
         (&misshapen, "\"network.trunk.bias\""),
     ] {
         let error = versions.publish("cpn", bytes).unwrap_err();

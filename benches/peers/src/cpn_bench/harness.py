@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
@@ -99,6 +100,14 @@ def check_cores(threads: int) -> None:
 def module(name: str, *options: str) -> list[str]:
     """The command of a module of ours, in this environment."""
     return [sys.executable, "-m", f"cpn_bench.{name}", *options]
+
+
+def torch_devices() -> list[str]:
+    """Devices of libtorch to measure on: the processor, and a CUDA device where there is one."""
+    if torch.cuda.is_available():
+        return ["cpu", "cuda"]
+    print("no CUDA device: no rows for one", flush=True)
+    return ["cpu"]
 
 
 @contextmanager

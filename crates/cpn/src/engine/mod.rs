@@ -1,4 +1,4 @@
-//! The outer loss and its gradient without an autograd graph: the passes over g_θ are derived by hand.
+//! Engines, and the native one: the outer loss and its gradient without an autograd graph, the passes over g_θ derived by hand.
 //!
 //! A training step differentiates through the inner loop, and so through a gradient. In terms of one layer y = f(x):
 //!
@@ -16,11 +16,11 @@
 //! The same quantities serve both branches of g_θ, and the policy's rollout is also the first rollout of the inner loop.
 //!
 //! Six storeys, each of which uses only those before it: `simd` (registers), `gemm` (matrix products), `layers`, `networks`,
-//! `planning` (the inner loop and the searches) and `training` (the outer loop).
+//! `planning` (the inner loop) and `training` (the outer loop).
 //!
 //! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
 //! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
-//! ([`EncoderPass`]). Tested against autograd in float64 (`tests/gradients.rs`).
+//! ([`EncoderPass`]). Tested against autograd in float64 (`crates/cpn-torch/tests/gradients.rs`).
 
 pub(crate) mod gemm;
 pub(crate) mod layers;
@@ -29,9 +29,55 @@ pub(crate) mod planning;
 pub(crate) mod simd;
 pub(crate) mod training;
 
+use crate::learner::Learner;
+use crate::method::Method;
+use crate::model::Model;
+use crate::precision::Precision;
+use crate::recipe::Training;
+use std::fmt::Debug;
+
 pub use layers::linear::Weights;
 pub use planning::planner::Planner;
 pub use simd::element::Element;
+pub use training::adam::Adam;
 pub use training::encoder_pass::EncoderPass;
+pub use training::learner::NativeLearner;
 pub use training::outer_loop::{OuterLoop, Samples};
 pub use training::outer_loss::{Gradient, OuterLoss};
+
+/// Computes plans and training steps of a model.
+pub trait Engine: Debug + Send + Sync {
+    /// A planner of a model whose weights fit its configuration, with images embedded in this precision where the engine has it.
+    ///
+    /// # Errors
+    /// If the device fails, with the option to change.
+    fn planner(&self, model: &Model, precision: Precision) -> Result<Box<dyn Method>, EngineError>;
+
+    /// Training of a model by valid settings.
+    ///
+    /// # Errors
+    /// If the device fails, with the option to change.
+    fn learner(&self, model: Model, training: &Training) -> Result<Box<dyn Learner>, EngineError>;
+}
+
+/// A device that cannot be computed on.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct EngineError(pub String);
+
+/// The engine of this crate, on the processor.
+#[derive(Debug, Clone, Copy)]
+pub struct Native {
+    /// Number of threads, at least one.
+    pub threads: usize,
+}
+
+impl Engine for Native {
+    fn planner(&self, model: &Model, precision: Precision) -> Result<Box<dyn Method>, EngineError> {
+        Ok(Box::new(Planner::new(model, precision, self.threads)))
+    }
+
+    fn learner(&self, model: Model, training: &Training) -> Result<Box<dyn Learner>, EngineError> {
+        Ok(Box::new(NativeLearner::new(model, training, self.threads)))
+    }
+}

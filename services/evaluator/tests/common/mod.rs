@@ -4,7 +4,7 @@
 #![expect(clippy::unwrap_used, reason = "tests")]
 
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig};
+use cpn::{EncoderConfig, MethodKind, Model, ModelConfig};
 use planner::Planner;
 use service_kit::SessionConfig;
 use std::net::TcpListener;
@@ -90,7 +90,7 @@ pub fn models(folder: &Path, seed: u64) -> PathBuf {
     let paper = ModelConfig::paper(MethodKind::Cpn);
     let of_positions = ModelConfig { encoder: EncoderConfig::position([600, 0, 200], 70), actions: 3, ..paper.clone() };
     for (name, config) in [("cpn", paper), ("jenga", of_positions)] {
-        let bytes = checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap();
+        let bytes = checkpoint::to_bytes(&Model::new(config, seed), &provenance).unwrap();
         std::fs::write(models_dir.join(name).with_extension("safetensors"), bytes).unwrap();
     }
     models_dir

@@ -6,7 +6,7 @@
 use cpn::checkpoint::{self, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig};
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
-use cpn::{Agent, EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
+use cpn::{EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
 use planner::model::Model;
 use planner::{Config, Planner};
@@ -250,7 +250,7 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
         seed,
         training: cpn::Training::paper(),
     };
-    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+    checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
 }
 
 /// A checkpoint of few, random weights that plans from position to position.
@@ -264,7 +264,7 @@ pub fn position_checkpoint(seed: u64) -> Vec<u8> {
         seed,
         training: cpn::Training::paper(),
     };
-    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+    checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
 }
 
 /// A plan from one position to another.

@@ -2,6 +2,7 @@
 
 use anyhow::{Context, ensure};
 use cpn::{ModelConfig, Preset, Recipe, Training};
+use engines::{Device, EngineKind};
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
 use figment::value::Value;
@@ -13,11 +14,11 @@ use std::time::Duration;
 /// How the names of environment variables begin.
 const PREFIX: &str = "CPN_TRAIN_";
 /// Settings that are text, whatever they look like.
-const TEXTS: [&str; 4] = ["preset", "dataset", "out", "run_dir"];
+const TEXTS: [&str; 6] = ["preset", "dataset", "out", "run_dir", "engine", "device"];
 /// Most threads of a run: more than any machine has to gain from.
 const MAX_THREADS: usize = 1024;
 /// Settings of a run, by their names.
-const FIELDS: [&str; 10] = [
+const FIELDS: [&str; 12] = [
     "preset",
     "model",
     "training",
@@ -25,6 +26,8 @@ const FIELDS: [&str; 10] = [
     "out",
     "hold_out",
     "seed",
+    "engine",
+    "device",
     "threads",
     "save_interval_seconds",
     "run_dir",
@@ -48,7 +51,12 @@ pub struct Config {
     pub hold_out: Vec<String>,
     /// Seed of initialisation and sampling.
     pub seed: u64,
-    /// Threads that compute. The order of sums depends on their number, and with it the last bits of the weights.
+    /// Engine that computes; none for the device's own: native on the CPU, torch on a CUDA device.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub engine: Option<EngineKind>,
+    /// Device that computes.
+    pub device: Device,
+    /// Number of threads that compute on the CPU. The order of sums depends on their number, and with it the last bits of the weights.
     pub threads: usize,
     /// How often the run saves its state; 0 is after each step.
     pub save_interval_seconds: f64,
@@ -68,6 +76,8 @@ impl From<Preset> for Config {
             out: format!("runs/checkpoints/{}.safetensors", preset.name()).into(),
             hold_out: Vec::new(),
             seed: 0,
+            engine: None,
+            device: Device::Cpu,
             threads: 1,
             save_interval_seconds: 60.0,
             run_dir: None,

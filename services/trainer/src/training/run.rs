@@ -1,15 +1,13 @@
 //! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
 
-use crate::training::adam::Adam;
 use crate::training::config::Config;
 use crate::training::dataset::Dataset;
-use crate::training::learner::Learner;
 use crate::training::progress::{Meter, Observer};
 use crate::training::sampler::Sampler;
 use anyhow::{Context, ensure};
-use cpn::Recipe;
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
+use cpn::{Learner, Model, Recipe};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::f64::consts::PI;
@@ -61,7 +59,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     ensure!(!config.out.is_dir(), "out: expected the path of a file, got that of a folder, {}", config.out.display());
     let recipe = config.recipe();
     let Recipe { model, training } = &recipe;
-    tch::set_num_threads(i32::try_from(config.threads).context("threads: expected a number of them")?);
+    let engine = engines::build(config.engine, config.device, config.threads)?;
     let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
     let dataset = Dataset::load(&config.dataset, &config.hold_out, model.encoder.input())?;
     let (expected, got) = (model.actions, dataset.action_size());
@@ -73,9 +71,9 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     }
     info!(tasks = tasks.len(), episodes = dataset.episodes().len(), samples = dataset.sample_count(), "demonstrations");
 
-    let mut learner = Learner::new(&recipe, config.seed, config.threads);
+    let mut learner = engine.learner(Model::new(model.clone(), config.seed), training)?;
     let state = Saved { path: config.out.with_extension(RESUME), config, dataset: &dataset };
-    let (start, loss) = state.resume(&mut learner.optimiser)?;
+    let (start, loss) = state.resume(&mut *learner)?;
     observer.begin(start)?;
 
     let sampler = Sampler::new(&dataset, &recipe, config.seed);
@@ -92,15 +90,15 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
         });
         for (step, batch) in (start..total).zip(batches) {
             if observer.should_stop(step) {
-                state.save(step, &learner.optimiser, &meter)?;
+                state.save(step, &*learner, &meter)?;
                 return Ok(Some(step));
             }
             let learning_rate = one_cycle(step, total, training.peak_learning_rate);
-            let learnt = learner.step(&batch, learning_rate).with_context(|| format!("step {step}"))?;
-            let samples = batch.observations.size()[0] as usize;
-            observer.observe(&meter.step(step + 1, samples, learnt.loss, learning_rate, learnt.gradient_norm))?;
+            let result = learner.step(&batch, learning_rate).with_context(|| format!("step {step}"))?;
+            let samples = batch.observations.len();
+            observer.observe(&meter.step(step + 1, samples, result.loss, learning_rate, result.gradient_norm))?;
             if saved.elapsed() >= save_interval {
-                state.save(step + 1, &learner.optimiser, &meter)?;
+                state.save(step + 1, &*learner, &meter)?;
                 saved = Instant::now();
             }
         }
@@ -117,7 +115,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
         seed: config.seed,
         training: training.clone(),
     };
-    let bytes = checkpoint::to_bytes(&learner.agent, &provenance)?;
+    let bytes = checkpoint::to_bytes(&learner.model(), &provenance)?;
     files::write_atomically(&config.out, &bytes)?;
     state.remove()?;
     Ok(Outcome::Finished { digest: checkpoint::digest(&bytes) })
@@ -145,12 +143,12 @@ impl Saved<'_> {
         ResumePoint { recipe: self.config.recipe(), seed, data_digest: self.dataset.digest().to_owned(), step, loss }
     }
 
-    fn save(&self, step: u64, adam: &Adam, meter: &Meter) -> anyhow::Result<()> {
-        files::write_atomically(&self.path, &archive::to_bytes(&adam.state(), &self.point(step, meter.loss))?)
+    fn save(&self, step: u64, learner: &dyn Learner, meter: &Meter) -> anyhow::Result<()> {
+        files::write_atomically(&self.path, &archive::to_bytes(&learner.state(), &self.point(step, meter.loss))?)
     }
 
     /// Takes up the state, if there is one; answers the number of steps done and the mean loss.
-    fn resume(&self, adam: &mut Adam) -> anyhow::Result<(u64, Option<f64>)> {
+    fn resume(&self, learner: &mut dyn Learner) -> anyhow::Result<(u64, Option<f64>)> {
         if !self.path.exists() {
             return Ok((0, None));
         }
@@ -158,7 +156,7 @@ impl Saved<'_> {
             let (state, got): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(&self.path)?)?;
             let expected = self.point(got.step, got.loss);
             ensure!(expected == got, "expected the state of this run, {expected:?}, got that of another, {got:?}");
-            adam.restore(&state, i32::try_from(got.step)?)?;
+            learner.restore(&state, u32::try_from(got.step)?)?;
             info!(step = got.step, "resumed");
             Ok((got.step, got.loss))
         };

@@ -2,14 +2,12 @@
 
 use crate::training::augment::Look;
 use crate::training::dataset::{Dataset, Episode};
-use cpn::loss::Batch;
 use cpn::recipe::{GoalSampling, Recipe, Training};
-use cpn::{Frames, images};
+use cpn::{Batch, Frames, images};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::HashMap;
-use tch::Tensor;
 
 /// A moment of an episode and what it is to lead to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -97,7 +95,7 @@ impl<'a> Sampler<'a> {
         samples
     }
 
-    /// The tensors of some samples, those of step `step` of the run, which decides how the images are changed.
+    /// The batch of some samples, those of step `step` of the run, which decides how the images are changed.
     pub fn batch(&self, step: u64, samples: &[Sample]) -> Batch {
         let (horizon, size) = (self.horizon, self.dataset.action_size());
         let mut rows = Rows { dataset: self.dataset, places: HashMap::new(), frames: Vec::new() };
@@ -116,14 +114,7 @@ impl<'a> Sampler<'a> {
                 }
             }
         }
-        let (batch, horizon) = (samples.len() as i64, horizon as i64);
-        Batch {
-            frames: self.frames(step, &rows.frames),
-            observations: Tensor::from_slice(&observations),
-            goals: Tensor::from_slice(&goals),
-            actions: Tensor::from_slice(&actions).view([batch, horizon, size as i64]),
-            mask: Tensor::from_slice(&mask).view([batch, horizon]),
-        }
+        Batch { frames: self.frames(step, &rows.frames), observations, goals, actions, mask }
     }
 
     /// Some frames, each of an episode and at an index among all, as the encoder takes them.
@@ -161,16 +152,16 @@ impl<'a> Sampler<'a> {
 struct Rows<'a> {
     dataset: &'a Dataset,
     /// By index among all frames, the row.
-    places: HashMap<usize, i64>,
+    places: HashMap<usize, usize>,
     /// By row, the episode and the index.
     frames: Vec<(u32, usize)>,
 }
 
 impl Rows<'_> {
     /// The row of a frame, which is added if it is new.
-    fn place(&mut self, episode: u32, step: u32) -> i64 {
+    fn place(&mut self, episode: u32, step: u32) -> usize {
         let index = self.dataset.episodes()[episode as usize].first_frame + step as usize;
-        let next = self.frames.len() as i64;
+        let next = self.frames.len();
         let place = *self.places.entry(index).or_insert(next);
         if place == next {
             self.frames.push((episode, index));

@@ -4,7 +4,7 @@
 
 use cpn::checkpoint::{self, Provenance};
 use cpn::config::{ConvConfig, ImageEncoderConfig};
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, images};
+use cpn::{EncoderConfig, MethodKind, Model, ModelConfig, images};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use recording::Episode;
@@ -91,7 +91,7 @@ pub fn checkpoint(seed: u64) -> Vec<u8> {
         seed,
         training: cpn::Training::paper(),
     };
-    checkpoint::to_bytes(&Agent::new(config, seed), &provenance).unwrap()
+    checkpoint::to_bytes(&Model::new(config, seed), &provenance).unwrap()
 }
 
 /// A session that listens, and one that connects to it.

@@ -51,6 +51,8 @@ class Setting:
     method: str
     batch: int = 1
     threads: int = 1
+    engine: str = "native"
+    device: str = "cpu"
     grown: str | None = None
     """What differs from the paper's values."""
     value: int = 0
@@ -60,7 +62,8 @@ class Setting:
         """For rows and people."""
         if self.grown:
             return f"{self.method}, {self.grown} {self.value}"
-        return f"{self.method}, batch {self.batch}, {self.threads} thread{'s'[: self.threads > 1]}"
+        name = f"{self.method}, batch {self.batch}, {self.threads} thread{'s'[: self.threads > 1]}"
+        return name if self.engine == "native" else f"{name}, engine {self.engine} on {self.device}"
 
 
 FLOORS = {
@@ -89,7 +92,9 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
     """Takes all in turns, and prints what they came to; answers a row for each peer."""
     with written_model(ours, setting) as path:
         options = ["--model", str(path), "--batch", str(setting.batch), "--threads", str(setting.threads)]
-        commands = {OURS: [*ours, *options]} | {peer: [*PEERS[peer], *options] for peer in peers}
+        options += ["--device", setting.device] if setting.device != "cpu" else []
+        engine = ["--engine", setting.engine] if setting.engine != "native" else []
+        commands = {OURS: [*ours, *options, *engine]} | {peer: [*PEERS[peer], *options] for peer in peers}
         with harness.contenders(commands, setting.threads) as started:
             planners = [contender for contender in started if contender.name != ONNX]
             harness.agree(planners, "actions", setting.name, RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE)
@@ -161,6 +166,8 @@ def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
     peers, effort = ((EAGER, JAX), QUICK) if quick else (tuple(PEERS), MAIN)
     for setting in settings():
         keep(compare(command, peers, setting, effort))
+    for device in harness.torch_devices():
+        keep(compare(command, (EAGER,), Setting("cpn", max(BATCHES), engine="torch", device=device), effort))
     keep(compare_precisions(command, effort))
     if not quick:
         for grown, values in GROWTH.items():

@@ -23,8 +23,9 @@ from cpn_bench.plan.model import PlanModel
 class Planner:
     """A frozen agent that plans."""
 
-    def __init__(self, data: PlanModel, compiled: bool = False) -> None:
-        self.agent = Agent(data.model, tensors(data.weights)).requires_grad_(False)
+    def __init__(self, data: PlanModel, compiled: bool = False, device: str = "cpu") -> None:
+        self.device = device
+        self.agent = Agent(data.model, tensors(data.weights)).requires_grad_(False).to(device)
         self.plan_tensors = (
             torch.compile(self.traced, fullgraph=True, options={"cpp_wrapper": True}) if compiled else self.eager
         )
@@ -32,13 +33,13 @@ class Planner:
     @torch.no_grad()
     def embed(self, goals: NDArray[np.uint8]) -> Tensor:
         """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
-        return self.agent.encoder(torch.from_numpy(goals))
+        return self.agent.encoder(torch.from_numpy(goals).to(self.device))
 
     @torch.no_grad()
     def plan(self, observations: NDArray[np.uint8], goals: Tensor) -> Plans:
         """Plans from observations `[B, 84, 84, 3]` to goals `[B, Z]`."""
-        actions, losses = self.plan_tensors(torch.from_numpy(observations), goals)
-        return actions.numpy(), losses.numpy()
+        actions, losses = self.plan_tensors(torch.from_numpy(observations).to(self.device), goals)
+        return actions.cpu().numpy(), losses.cpu().numpy()
 
     def eager(self, observations: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
         """Encoder, rollout, and updates by a tape of the inner loss alone."""
@@ -69,11 +70,17 @@ class Planner:
         return actions, torch.stack([*losses, self.agent.inner_losses(actions, x, goals)])
 
 
-def main(model: Path, batch: int, threads: int, compile: bool = False) -> None:  # noqa: A002 - the option's name
+def main(
+    model: Path,
+    batch: int,
+    threads: int,
+    compile: bool = False,  # noqa: A002 - the option's name
+    device: str = "cpu",
+) -> None:
     """Plans as asked on stdin."""
     torch.set_num_threads(threads)
     data = PlanModel.read(model)
-    serve(Planner(data, compiled=compile), data, batch)
+    serve(Planner(data, compiled=compile, device=device), data, batch)
 
 
 if __name__ == "__main__":

@@ -49,6 +49,8 @@ class Setting:
 
     method: str
     threads: int = 1
+    engine: str = "native"
+    device: str = "cpu"
     grown: str | None = None
     """What differs from the paper's values."""
     value: int = 0
@@ -58,7 +60,8 @@ class Setting:
         """For rows and people."""
         if self.grown:
             return f"{self.method}, {self.grown} {self.value}"
-        return f"{self.method}, {self.threads} thread{'s'[: self.threads > 1]}"
+        name = f"{self.method}, {self.threads} thread{'s'[: self.threads > 1]}"
+        return name if self.engine == "native" else f"{name}, engine {self.engine} on {self.device}"
 
     @property
     def batch(self) -> int:
@@ -71,6 +74,7 @@ FLOORS = {
     (Setting("te-bc").name, EAGER): 1.5,
     (Setting("cpn").name, EAGER): 4.0,
     (Setting("cpn").name, JAX): 2.0,
+    (Setting("cpn", engine="torch").name, EAGER): 1.0,
 }
 
 
@@ -88,7 +92,9 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
         path = Path(folder) / "batches.safetensors"
         write_batches(ours, path, setting)
         options = ["--batches", str(path), "--method", setting.method, "--threads", str(setting.threads)]
-        commands = {OURS: [*ours, *options]} | {peer: [*PEERS[peer], *options] for peer in peers}
+        options += ["--device", setting.device] if setting.device != "cpu" else []
+        engine = ["--engine", setting.engine] if setting.engine != "native" else []
+        commands = {OURS: [*ours, *options, *engine]} | {peer: [*PEERS[peer], *options] for peer in peers}
         with harness.contenders(commands, setting.threads) as started:
             harness.agree(started, "loss", setting.name, LOSS_TOLERANCE)
             rates = harness.take_turns(started, effort) * setting.batch
@@ -119,6 +125,9 @@ def main(ours: str, out: Path, quick: bool = False) -> str | None:
         settings.append(Setting("cpn", threads=2))
     for setting in settings:
         harness.print_stages(setting.name, "a step", measure(peers, setting, effort))
+    for device in harness.torch_devices():
+        setting = Setting("cpn", engine="torch", device=device)
+        harness.print_stages(setting.name, "a step", measure((EAGER,), setting, effort))
     if not quick:
         for grown, values in GROWTH.items():
             for value in values:

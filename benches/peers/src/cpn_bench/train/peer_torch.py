@@ -61,10 +61,10 @@ class Learner(Agent):
 class Trainer:
     """An agent with its optimiser and its batches."""
 
-    def __init__(self, batches: Batches, compiled: bool = False, bfloat16: bool = False) -> None:
-        self.data = tensors(batches.arrays)
+    def __init__(self, batches: Batches, compiled: bool = False, bfloat16: bool = False, device: str = "cpu") -> None:
+        self.data = {name: tensor.to(device) for name, tensor in tensors(batches.arrays).items()}
         self.count = len(batches)
-        self.agent = Learner(batches.model, tensors(batches.weights))
+        self.agent = Learner(batches.model, tensors(batches.weights)).to(device)
         self.bfloat16 = bfloat16
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=LEARNING_RATE, fused=True)
         self.outer_loss = torch.compile(self.agent, fullgraph=True) if compiled else self.agent
@@ -88,10 +88,17 @@ class Trainer:
         return observations, goals, data["actions"][row], data["mask"][row]
 
 
-def main(batches: Path, method: str, threads: int, compile: bool = False, bfloat16: bool = False) -> None:  # noqa: A002 - the option's name
+def main(
+    batches: Path,
+    method: str,
+    threads: int,
+    compile: bool = False,  # noqa: A002 - the option's name
+    bfloat16: bool = False,
+    device: str = "cpu",
+) -> None:
     """Trains as asked on stdin."""
     torch.set_num_threads(threads)
-    serve(Trainer(Batches.read(batches, method), compiled=compile, bfloat16=bfloat16))
+    serve(Trainer(Batches.read(batches, method), compiled=compile, bfloat16=bfloat16, device=device))
 
 
 if __name__ == "__main__":

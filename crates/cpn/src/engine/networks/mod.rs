@@ -2,4 +2,4 @@
 
 pub mod encoder;
 pub mod policy_dynamics;
-pub mod variables;
+mod weights;

@@ -1,8 +1,5 @@
-//! Planning: the rollout of g_θ and the searches over it.
+//! Planning: the rollout of g_θ, and the planner that searches over it.
 
-pub mod descent;
-pub mod ongoing;
 pub mod planner;
 pub mod rollout;
-pub mod sampling_search;
 pub mod worker;

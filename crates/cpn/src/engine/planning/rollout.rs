@@ -2,6 +2,7 @@
 
 use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics, StepTape};
 use crate::engine::simd::element::Element;
+use crate::search::block::{Actions, Purpose};
 
 /// A rollout over a block of R samples.
 #[derive(Debug)]
@@ -12,28 +13,6 @@ pub struct Rollout<T> {
     pub goal_error: Vec<T>,
     /// The inner loss' gradient in the actions, `[H, R, A]`.
     pub gradient: Vec<T>,
-}
-
-/// Source of a rollout's actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Actions {
-    /// Given actions.
-    Given,
-    /// The actions of the rollout before, moved down its loss: the first step sees the same state again.
-    Moved,
-    /// Actions that the policy proposes along the way.
-    Proposed,
-}
-
-/// Purpose of a rollout.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Purpose {
-    /// The policy's actions; the state after the last is not computed.
-    Actions,
-    /// The inner loss alone: the steps may share a tape, which stays in the caches.
-    Loss,
-    /// The inner loss, and its gradient afterwards.
-    Gradient,
 }
 
 impl<T: Element> Rollout<T> {
@@ -47,7 +26,7 @@ impl<T: Element> Rollout<T> {
     }
 
     /// The states along the actions, `[H, R, A]`, in place of x, `[R, Z]`, and the error towards x_g, `[R, Z]`. Proposed actions
-    /// are written to `actions`.
+    /// are written to `actions`. For its loss alone the steps share a tape, which stays in the caches.
     pub fn forward(
         &mut self,
         network: &PolicyDynamics<T>,

@@ -1,11 +1,14 @@
-//! A thread's memory for plans, and the two steps that every search is made of: a rollout, and a step down its loss.
+//! A thread's memory for plans.
 
-use super::rollout::{Actions, Purpose, Rollout};
+use super::rollout::Rollout;
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::networks::encoder::EncoderTape;
 use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics};
 use crate::engine::simd::element::Element;
+use crate::search::Query;
+use crate::search::block::{Actions, PlanBlock, Purpose};
+use std::sync::Arc;
 
 /// R, the plans of a block: with more of them weights are read less often, with fewer the passes' intermediates lie nearer.
 pub const BLOCK: usize = 16;
@@ -18,7 +21,7 @@ pub struct Dynamics<T> {
     pub step_size: T,
     /// H.
     pub horizon: usize,
-    /// True if there is a goal to plan towards, false if there is only a policy to ask.
+    /// True if the method plans, false if it is a policy alone.
     pub plans: bool,
 }
 
@@ -26,6 +29,7 @@ pub struct Dynamics<T> {
 #[derive(Debug)]
 pub struct Worker<T: Element> {
     pub tape: EncoderTape<T>,
+    dynamics: Arc<Dynamics<T>>,
     rollout: Rollout<T>,
     buffers: Buffers<T>,
     /// x along a rollout, then x̄, `[R, Z]`.
@@ -35,7 +39,7 @@ pub struct Worker<T: Element> {
     /// Actions by step, then row, `[H, R, A]`.
     actions: Vec<T>,
     /// Identity of the descent that the last rollout belongs to.
-    pub resident: Option<u64>,
+    resident: Option<u64>,
 }
 
 impl<T: Element> Dynamics<T> {
@@ -52,7 +56,7 @@ impl<T: Element> Dynamics<T> {
 
 impl<T: Element> Worker<T> {
     /// Memory for blocks of up to [`BLOCK`] plans.
-    pub fn new(dynamics: &Dynamics<T>) -> Self {
+    pub fn new(dynamics: Arc<Dynamics<T>>) -> Self {
         let sizes = dynamics.network.sizes;
         let zeros = |columns: usize| vec![T::ZERO; BLOCK * columns];
         Self {
@@ -63,62 +67,64 @@ impl<T: Element> Worker<T> {
             x_g: zeros(sizes.latent),
             actions: zeros(dynamics.horizon * sizes.actions),
             resident: None,
+            dynamics,
         }
     }
 
-    /// Rolls out from x along the worker's actions, given or proposed by the policy; returns the inner losses. After a rollout for
-    /// its loss alone there is nothing to descend by. `ends` are x and x_g, `[Z]` each, row by row.
-    pub fn roll_out<'a>(
-        &mut self,
-        dynamics: &Dynamics<T>,
-        (source, purpose): (Actions, Purpose),
-        ends: impl Iterator<Item = (&'a [T], &'a [T])>,
-    ) -> impl Iterator<Item = T> {
-        let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
-        let Self { rollout, buffers, x, x_g, actions, resident, .. } = self;
-        *resident = None;
-        let mut rows = 0;
-        for (from, to) in ends {
-            x[rows * latent..][..latent].copy_from_slice(from);
-            x_g[rows * latent..][..latent].copy_from_slice(to);
-            rows += 1;
-        }
-
-        let ends = (&mut x[..rows * latent], &x_g[..rows * latent]);
-        rollout.forward(network, ends, (source, actions), purpose, buffers);
-        rollout.losses(network, rows)
-    }
-
-    /// Moves the actions of the rollout, of R = `rows` plans, a step down the inner loss.
-    pub fn descend(&mut self, dynamics: &Dynamics<T>, rows: usize) {
-        let sizes = dynamics.network.sizes;
-        let Self { rollout, buffers, x, actions, .. } = self;
-        rollout.vjp(&dynamics.network, &mut x[..rows * sizes.latent], buffers);
-        for (action, gradient) in
-            actions.iter_mut().zip(&rollout.gradient).take(dynamics.horizon * rows * sizes.actions)
-        {
-            *action -= dynamics.step_size * *gradient;
-        }
-    }
-
-    /// Action t of plan r of R = `rows`, `[A]`.
-    fn action(&mut self, dynamics: &Dynamics<T>, rows: usize, t: usize, r: usize) -> &mut [T] {
-        let size = dynamics.network.sizes.actions;
-        &mut self.actions[(t * rows + r) * size..][..size]
+    /// Start of action t of plan r of R = `rows`, of A numbers.
+    fn offset(&self, rows: usize, t: usize, r: usize) -> usize {
+        (t * rows + r) * self.dynamics.network.sizes.actions
     }
 }
 
-impl Worker<f32> {
-    /// The plan of row r of R = `rows`, `[H][A]`.
-    pub fn plan(&mut self, dynamics: &Dynamics<f32>, rows: usize, r: usize) -> Vec<Vec<f32>> {
-        (0..dynamics.horizon).map(|t| self.action(dynamics, rows, t, r).to_vec()).collect()
+impl PlanBlock for Worker<f32> {
+    fn capacity(&self) -> usize {
+        BLOCK
     }
 
-    /// Writes a plan, `[H][A]`, as row r of R = `rows`.
-    pub fn set_plan(&mut self, dynamics: &Dynamics<f32>, rows: usize, r: usize, plan: &[Vec<f32>]) {
+    fn is_searchable(&self) -> bool {
+        self.dynamics.plans
+    }
+
+    fn resident(&mut self) -> &mut Option<u64> {
+        &mut self.resident
+    }
+
+    fn plan(&self, rows: usize, r: usize) -> Vec<Vec<f32>> {
+        let size = self.dynamics.network.sizes.actions;
+        (0..self.dynamics.horizon).map(|t| self.actions[self.offset(rows, t, r)..][..size].to_vec()).collect()
+    }
+
+    fn set_plan(&mut self, rows: usize, r: usize, plan: &[Vec<f32>]) {
         self.resident = None;
         for (t, action) in plan.iter().enumerate() {
-            self.action(dynamics, rows, t, r).copy_from_slice(action);
+            let offset = self.offset(rows, t, r);
+            self.actions[offset..][..action.len()].copy_from_slice(action);
+        }
+    }
+
+    fn roll_out(&mut self, queries: &[Query<'_>], source: Actions, purpose: Purpose) -> Vec<f32> {
+        let Self { dynamics, rollout, buffers, x, x_g, actions, resident, .. } = self;
+        let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
+        *resident = None;
+        for (r, query) in queries.iter().enumerate() {
+            x[r * latent..][..latent].copy_from_slice(query.x);
+            x_g[r * latent..][..latent].copy_from_slice(query.x_g);
+        }
+
+        let rows = queries.len();
+        let ends = (&mut x[..rows * latent], &x_g[..rows * latent]);
+        rollout.forward(network, ends, (source, actions), purpose, buffers);
+        rollout.losses(network, rows).collect()
+    }
+
+    fn descend(&mut self, rows: usize) {
+        let Self { dynamics, rollout, buffers, x, actions, .. } = self;
+        let sizes = dynamics.network.sizes;
+        rollout.vjp(&dynamics.network, &mut x[..rows * sizes.latent], buffers);
+        let gradient = rollout.gradient[..dynamics.horizon * rows * sizes.actions].iter();
+        for (action, gradient) in actions.iter_mut().zip(gradient) {
+            *action -= dynamics.step_size * *gradient;
         }
     }
 }

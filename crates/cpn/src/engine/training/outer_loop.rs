@@ -6,9 +6,10 @@ use crate::engine::layers::passes::Order;
 use crate::engine::networks::policy_dynamics::{
     Branches, Buffers, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
 };
-use crate::engine::planning::rollout::{Actions, Purpose, Rollout, huber_grad};
+use crate::engine::planning::rollout::{Rollout, huber_grad};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
+use crate::search::block::{Actions, Purpose};
 use rayon::prelude::*;
 
 /// R, the samples of a block in training: more, and weights are read less often; fewer, and the passes' intermediates stay nearer.

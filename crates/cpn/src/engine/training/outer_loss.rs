@@ -2,14 +2,13 @@
 
 use super::encoder_pass::EncoderPass;
 use super::outer_loop::{OuterLoop, Samples};
-use crate::agent::Agent;
-use crate::engine::networks::variables::{Variables, floats};
+use crate::batch::Batch;
+use crate::config::ModelConfig;
+use crate::engine::layers::linear::Weights;
 use crate::engine::simd::vector::add;
-use crate::loss::Batch;
 use crate::precision::Precision;
 use std::collections::BTreeMap;
 use std::time::Instant;
-use tch::Tensor;
 
 /// An outer loss with its gradient.
 #[derive(Debug)]
@@ -25,41 +24,42 @@ pub struct Gradient {
 /// Outer losses and their gradients without a graph ([`crate::engine`]).
 #[derive(Debug)]
 pub struct OuterLoss {
+    /// Z.
+    latent: usize,
     encoder_pass: EncoderPass<f32>,
     outer_loop: OuterLoop<f32>,
 }
 
 impl OuterLoss {
-    /// Outer losses of agents with this one's configuration, with images embedded in this precision, on some threads.
-    pub fn new(agent: &Agent, precision: Precision, threads: usize) -> Self {
+    /// Outer losses of models of a valid configuration, with images embedded in this precision, on some threads.
+    pub fn new(config: &ModelConfig, precision: Precision, threads: usize) -> Self {
         Self {
-            encoder_pass: EncoderPass::new(agent.config().encoder.clone(), precision, threads),
-            outer_loop: OuterLoop::new(agent.config().clone(), threads),
+            latent: config.encoder.latent() as usize,
+            encoder_pass: EncoderPass::new(config.encoder.clone(), precision, threads),
+            outer_loop: OuterLoop::new(config.clone(), threads),
         }
     }
 
-    /// The outer loss of a batch and its gradient, by the name of each weight that takes part; agrees with autograd's of
-    /// [`Agent::outer_loss`].
-    pub fn differentiate(&mut self, agent: &Agent, batch: &Batch) -> Gradient {
+    /// The outer loss of a batch and its gradient, by the name of each weight that takes part; agrees with autograd's.
+    pub fn differentiate(&mut self, weights: &impl Weights<f32>, batch: &Batch) -> Gradient {
         let started = Instant::now();
-        let variables = agent.variables().variables();
-        let (embeddings, embedded) = self.encoder_pass.forward(&Variables(&variables), batch.frames.observed());
+        let (embeddings, embedded) = self.encoder_pass.forward(weights, batch.frames.observed());
         let encoding = started.elapsed();
 
         // The samples' rows of the embeddings.
-        let latent = agent.config().encoder.latent() as usize;
-        let rows = |indices: &Tensor| floats::<i64>(indices).into_iter().map(|row| row as usize * latent);
-        let gather = |indices| rows(indices).flat_map(|at| &embeddings[at..at + latent]).copied().collect::<Vec<f32>>();
+        let latent = self.latent;
+        let gather = |rows: &[usize]| -> Vec<f32> {
+            rows.iter().flat_map(|row| &embeddings[row * latent..][..latent]).copied().collect()
+        };
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
-        let (actions, mask) = (floats(&batch.actions), floats(&batch.mask));
-        let samples = Samples { x: &x, x_g: &x_g, actions: &actions, mask: &mask };
-        let outer = self.outer_loop.run(&Variables(&variables), samples);
+        let samples = Samples { x: &x, x_g: &x_g, actions: &batch.actions, mask: &batch.mask };
+        let outer = self.outer_loop.run(weights, samples);
 
         // Each frame's gradient is the sum over the samples that it belongs to.
         let mut hat = vec![0.0; embeddings.len()];
-        for (indices, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
-            for (at, gradient) in rows(indices).zip(gradient.chunks_exact(latent)) {
-                add(&mut hat[at..at + latent], gradient);
+        for (rows, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
+            for (row, gradient) in rows.iter().zip(gradient.chunks_exact(latent)) {
+                add(&mut hat[row * latent..][..latent], gradient);
             }
         }
 

@@ -1,5 +1,5 @@
 //! The inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks"), by
-//! autograd. What is served does the same without a graph ([`crate::engine`]).
+//! autograd. What is served does the same without a graph ([`cpn::engine`]).
 
 use crate::dynamics::PolicyDynamics;
 use tch::{Kind, Reduction, Tensor};
@@ -63,7 +63,7 @@ impl InnerLoop<'_> {
     }
 
     /// The initial plan: the actions `[B, H, A]` of the policy along its own predicted states.
-    fn policy_rollout(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
+    pub fn policy_rollout(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         let mut x = x.shallow_clone();
         let mut actions = Vec::new();
         for step in 0..self.horizon {
@@ -79,7 +79,7 @@ impl InnerLoop<'_> {
 
     /// The inner loss of each plan, `[B]`: Huber between the state predicted after `actions` `[B, H, A]` and the goal,
     /// summed over the latent.
-    fn loss(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Tensor {
+    pub fn loss(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Tensor {
         let mut x = x.shallow_clone();
         for action in actions.unbind(1) {
             let features = self.network.features(&x, x_g);
@@ -89,7 +89,13 @@ impl InnerLoop<'_> {
     }
 
     /// The inner loss `[B]` and its gradient in the actions `[B, H, A]`.
-    fn loss_and_gradient(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor, create_graph: bool) -> (Tensor, Tensor) {
+    pub fn loss_and_gradient(
+        &self,
+        x: &Tensor,
+        x_g: &Tensor,
+        actions: &Tensor,
+        create_graph: bool,
+    ) -> (Tensor, Tensor) {
         let loss = self.loss(x, x_g, actions);
         let total = loss.sum(None::<Kind>);
         let gradient = Tensor::run_backward(&[total], &[actions], create_graph, create_graph).remove(0);

@@ -4,14 +4,15 @@
 
 mod common;
 
-use common::{double_agent, encoders, frames, noise_images, position_config, small_config, uniform};
+use common::{new_agent, uniform};
 use cpn::config::ConvConfig;
-use cpn::encoder::Precision;
 use cpn::engine::{EncoderPass, OuterLoop, Samples, Weights};
-use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, loss};
+use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, Precision};
+use cpn_torch::{loss, tensors};
 use proptest::prelude::*;
 use std::collections::HashMap;
 use tch::{Kind, Tensor};
+use testing::{encoders, noise_images, position_config, small_config};
 
 struct Named(HashMap<String, Tensor>);
 
@@ -26,7 +27,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
 }
 
 fn check(config: ModelConfig, rows: i64, threads: usize) {
-    let agent = double_agent(config.clone());
+    let agent = new_agent(config.clone());
     let latent = config.encoder.latent();
     let scale = 2.0;
     let x = (uniform(&[rows, latent], 1) * scale).set_requires_grad(true);
@@ -94,12 +95,12 @@ fn gates_in_parts_agree_with_autograd() {
 
 /// Embeddings, and the gradient of a loss that is linear in them.
 fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
-    let agent = double_agent(config.clone());
+    let agent = new_agent(config.clone());
     let frames = match config.encoder.input() {
-        Input::Image => frames(&noise_images(rows as i64, 5)),
+        Input::Image => Frames::Images(noise_images(rows, 5)),
         Input::Position => Frames::Positions((0..rows).map(|row| [row as f32 / 8.0, 0.3, -0.6]).collect()),
     };
-    let reference = agent.encoder().encode(&frames.tensor());
+    let reference = agent.encoder().encode(&tensors::from_frames(&frames));
     let hat = uniform(&reference.size(), 6);
     (&reference * &hat).sum(None::<Kind>).backward();
 

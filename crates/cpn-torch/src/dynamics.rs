@@ -1,7 +1,7 @@
 //! g_θ, the combined policy and dynamics network (figure "encoder", b).
 
-use crate::config::ModelConfig;
 use crate::neuromodulated::Neuromodulated;
+use cpn::ModelConfig;
 use tch::Tensor;
 use tch::nn::{self, Module};
 

@@ -1,8 +1,8 @@
 //! Searches in pieces.
 
 use super::descent::Descent;
-use super::sampling_search::SamplingSearch;
-use crate::search::{Plan, Solver, rollouts};
+use super::query::{Plan, Solver, rollouts};
+use super::sampling::SamplingSearch;
 
 /// A search in pieces, by [`Method::resume`](crate::Method::resume). The division into pieces changes no bit of the plans, which
 /// are those of [`Method::plan`](crate::Method::plan).

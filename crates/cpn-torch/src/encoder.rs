@@ -1,11 +1,9 @@
 //! The encoder f_φ, shared by observation and goal (figure "encoder", a).
 
-use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
-use crate::{images, positions};
+use cpn::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
+use cpn::{images, positions};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
-
-pub use crate::precision::Precision;
 
 /// What suits the input, then a linear layer to the embedding.
 #[derive(Debug)]
@@ -75,7 +73,7 @@ impl Body {
             layers.push(nn::linear(path / "layer" / i, width, outputs, Default::default()));
             width = outputs;
         }
-        let centre_metres = Tensor::from_slice(&config.centre_mm.map(|mm| mm as f64 / 1e3));
+        let centre_metres = Tensor::from_slice(&config.centre_mm.map(|mm| mm as f64 / 1e3)).to_device(path.device());
         (Self::Position { centre_metres, scale_metres: config.scale_mm as f64 / 1e3, layers }, width)
     }
 

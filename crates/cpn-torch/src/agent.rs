@@ -1,11 +1,11 @@
 //! A learned method of the comparison, to be trained (section "Methods for comparison").
 
-use crate::config::ModelConfig;
 use crate::dynamics::PolicyDynamics;
 use crate::encoder::Encoder;
 use crate::inner_loop::{InnerLoop, TensorPlan};
-use crate::loss::{self, Batch};
-use std::sync::{Mutex, PoisonError};
+use crate::loss::{self, TensorBatch};
+use crate::tensors;
+use cpn::{Model, ModelConfig};
 use tch::{Device, Tensor, nn};
 
 /// A learned method: encoder, g_θ and the step size of its inner loop.
@@ -19,29 +19,30 @@ pub struct Agent {
 }
 
 impl Agent {
-    /// A freshly initialised agent, the same for the same seed. The configuration must be valid.
-    pub fn new(config: ModelConfig, seed: u64) -> Self {
-        // libtorch's generator is one for the whole process.
-        static GENERATOR: Mutex<()> = Mutex::new(());
-        let _generator = GENERATOR.lock().unwrap_or_else(PoisonError::into_inner);
-        tch::manual_seed(seed.cast_signed());
-        let variables = nn::VarStore::new(Device::Cpu);
+    /// The agent of a model whose weights fit its configuration, on a device.
+    pub fn new(model: &Model, device: Device) -> Self {
+        let Model { config, weights } = model;
+        let variables = nn::VarStore::new(device);
         let root = variables.root();
-        Self {
+        let agent = Self {
             encoder: Encoder::new(&(&root / "encoder"), &config.encoder),
-            network: PolicyDynamics::new(&(&root / "network"), &config),
+            network: PolicyDynamics::new(&(&root / "network"), config),
             step_size: root.ones("step_size", &[]),
-            config,
+            config: config.clone(),
             variables,
+        };
+        for (name, mut variable) in agent.variables.variables() {
+            tch::no_grad(|| variable.copy_(&tensors::from_archive(&weights[&name])));
         }
+        agent
     }
 
-    /// What the agent is made of.
+    /// Sizes and method.
     pub fn config(&self) -> &ModelConfig {
         &self.config
     }
 
-    /// The named weights; the trainer updates them in place.
+    /// The named weights.
     pub fn variables(&self) -> &nn::VarStore {
         &self.variables
     }
@@ -52,9 +53,13 @@ impl Agent {
     }
 
     /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates, all of it by
-    /// autograd: the reference for [`OuterLoss`](crate::engine::OuterLoss).
-    pub fn outer_loss(&self, batch: &Batch) -> Tensor {
-        let embeddings = self.encoder.encode(&batch.frames.tensor());
+    /// autograd: the reference for [`OuterLoss`](cpn::engine::OuterLoss).
+    pub fn outer_loss(&self, batch: &TensorBatch) -> Tensor {
+        self.embedded_loss(&self.encoder.encode(&batch.frames), batch)
+    }
+
+    /// The outer loss of a batch whose frames are embedded, `[F, Z]`.
+    pub fn embedded_loss(&self, embeddings: &Tensor, batch: &TensorBatch) -> Tensor {
         let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));
         loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), &batch.actions, &batch.mask)
     }
@@ -98,7 +103,7 @@ impl Agent {
         tch::no_grad(|| self.encoder.encode(input))
     }
 
-    /// Plans from x to x_g, both `[B, Z]`: the reference for [`crate::Planner`].
+    /// Plans from x to x_g, both `[B, Z]`: the reference for [`Planner`](cpn::Planner).
     pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         if self.config.method.plans() {
             self.inner_loop().plan(x, x_g)

@@ -4,15 +4,19 @@
 
 mod common;
 
+use cpn::ModelConfig;
 use cpn::archive::{self, Tensors};
-use cpn::{Agent, ModelConfig};
+use cpn_torch::{Agent, tensors};
+use std::collections::BTreeMap;
 use tch::{Kind, Tensor};
 
 /// The agent with the reference's weights, in float64, and everything else the reference wrote.
-fn load(method: &str) -> (Agent, Tensors) {
+fn load(method: &str) -> (Agent, BTreeMap<String, Tensor>) {
     let path = format!("{}/../../tests/golden/{method}.safetensors", env!("CARGO_MANIFEST_DIR"));
-    let (tensors, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
-    let agent = common::double_agent(config);
+    let (archive, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
+    let tensors: BTreeMap<_, _> =
+        archive.into_iter().map(|(name, tensor)| (name, tensors::from_archive(&tensor))).collect();
+    let agent = common::new_agent(config);
     for (name, mut variable) in agent.variables().variables() {
         tch::no_grad(|| variable.copy_(&tensors[&format!("weight.{name}")]));
     }

@@ -1,8 +1,7 @@
 //! Sampling-based searches: CEM, MPPI and CEM with a gradient step.
 
-use super::rollout::{Actions, Purpose};
-use super::worker::{BLOCK, Dynamics, Worker};
-use crate::search::{Plan, Query, Solver};
+use super::block::{Actions, PlanBlock, Purpose};
+use super::query::{Plan, Query, Solver};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -54,11 +53,11 @@ pub struct SamplingSearch {
 
 impl SamplingSearch {
     /// The first rollout, of the plan that the first generation is drawn around.
-    pub fn begin(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>) -> Self {
+    pub fn begin(block: &mut impl PlanBlock, query: Query<'_>) -> Self {
         let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
-        worker.set_plan(dynamics, 1, 0, query.start);
-        let loss = roll_out(worker, dynamics, query, (source, Purpose::Loss));
-        let best = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+        block.set_plan(1, 0, query.start);
+        let loss = block.roll_out(&[query], source, Purpose::Loss)[0];
+        let best = Candidate { actions: block.plan(1, 0), loss };
         let std = best.actions.iter().map(|action| vec![INITIAL_STD; action.len()]).collect();
         Self {
             rng: ChaCha8Rng::seed_from_u64(query.seed),
@@ -72,21 +71,21 @@ impl SamplingSearch {
         }
     }
 
-    /// A piece of a generation: a block of plans for each worker and, with the last of a generation, its fit.
-    pub fn advance(&mut self, workers: &mut [Worker<f32>], dynamics: &Dynamics<f32>, query: Query<'_>, solver: Solver) {
+    /// A piece of a generation: plans for each block and, with the last of a generation, its fit.
+    pub fn advance<B: PlanBlock>(&mut self, blocks: &mut [B], query: Query<'_>, solver: Solver) {
         let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { return };
         let tried = self.generation.len();
-        let piece = (count - tried).min(BLOCK * workers.len());
+        let piece = (count - tried).min(blocks[0].capacity() * blocks.len());
         self.generation.extend(self.distribution.sample(piece, &mut self.rng));
-        evaluate(workers, dynamics, query, &mut self.generation[tried..]);
+        evaluate(blocks, query, &mut self.generation[tried..]);
         self.rollouts += piece;
         if self.generation.len() == count {
-            self.fit(&mut workers[0], dynamics, query, solver);
+            self.fit(&mut blocks[0], query, solver);
         }
     }
 
     /// The end of a generation: fits the distribution to it, and keeps the best plan.
-    fn fit(&mut self, worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, solver: Solver) {
+    fn fit(&mut self, block: &mut impl PlanBlock, query: Query<'_>, solver: Solver) {
         self.done += 1;
         let mut generation = std::mem::take(&mut self.generation);
         generation.sort_by(|a, b| a.loss.total_cmp(&b.loss));
@@ -100,11 +99,11 @@ impl SamplingSearch {
         }
 
         if let Solver::Hybrid(_) = solver {
-            worker.set_plan(dynamics, 1, 0, &self.distribution.mean);
-            roll_out(worker, dynamics, query, (Actions::Given, Purpose::Gradient));
-            worker.descend(dynamics, 1);
-            let loss = roll_out(worker, dynamics, query, (Actions::Moved, Purpose::Loss));
-            let descended = Candidate { actions: worker.plan(dynamics, 1, 0), loss };
+            block.set_plan(1, 0, &self.distribution.mean);
+            block.roll_out(&[query], Actions::Given, Purpose::Gradient);
+            block.descend(1);
+            let loss = block.roll_out(&[query], Actions::Moved, Purpose::Loss)[0];
+            let descended = Candidate { actions: block.plan(1, 0), loss };
             if descended.loss < best.loss {
                 self.distribution.mean.clone_from(&descended.actions);
                 best = descended;
@@ -123,29 +122,24 @@ impl SamplingSearch {
     }
 }
 
-/// The inner loss of the worker's one plan.
-fn roll_out(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, how: (Actions, Purpose)) -> f32 {
-    worker.roll_out(dynamics, how, [(query.x, query.x_g)].into_iter()).sum()
-}
-
-/// The losses of candidates, a block for each worker at most.
-fn evaluate(workers: &mut [Worker<f32>], dynamics: &Dynamics<f32>, query: Query<'_>, candidates: &mut [Candidate]) {
-    if candidates.len() <= BLOCK {
+/// The losses of candidates, at most a block's capacity for each block.
+fn evaluate<B: PlanBlock>(blocks: &mut [B], query: Query<'_>, candidates: &mut [Candidate]) {
+    let size = blocks[0].capacity();
+    if candidates.len() <= size {
         // Another thread would only have to be woken.
-        return evaluate_block(&mut workers[0], dynamics, query, candidates);
+        return evaluate_block(&mut blocks[0], query, candidates);
     }
-    let blocks = workers.par_iter_mut().zip(candidates.par_chunks_mut(BLOCK));
-    blocks.for_each(|(worker, block)| evaluate_block(worker, dynamics, query, block));
+    let parts = blocks.par_iter_mut().zip(candidates.par_chunks_mut(size));
+    parts.for_each(|(block, candidates)| evaluate_block(block, query, candidates));
 }
 
-fn evaluate_block(worker: &mut Worker<f32>, dynamics: &Dynamics<f32>, query: Query<'_>, block: &mut [Candidate]) {
-    let rows = block.len();
-    for (r, candidate) in block.iter().enumerate() {
-        worker.set_plan(dynamics, rows, r, &candidate.actions);
+fn evaluate_block(block: &mut impl PlanBlock, query: Query<'_>, candidates: &mut [Candidate]) {
+    let rows = candidates.len();
+    for (r, candidate) in candidates.iter().enumerate() {
+        block.set_plan(rows, r, &candidate.actions);
     }
-    let ends = std::iter::repeat_n((query.x, query.x_g), rows);
-    let losses = worker.roll_out(dynamics, (Actions::Given, Purpose::Loss), ends);
-    for (candidate, loss) in block.iter_mut().zip(losses) {
+    let losses = block.roll_out(&vec![query; rows], Actions::Given, Purpose::Loss);
+    for (candidate, loss) in candidates.iter_mut().zip(losses) {
         candidate.loss = loss;
     }
 }

@@ -1,16 +1,12 @@
-//! Small models and batches for tests.
-
-#![allow(dead_code, reason = "each test file uses its part")]
+//! Small models and inputs for tests.
 
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
-use cpn::loss::Batch;
-use cpn::{Agent, EncoderConfig, Frames, MethodKind, ModelConfig, images};
+use cpn::{EncoderConfig, MethodKind, ModelConfig, images};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{Device, Kind, Tensor};
 
-/// A model with few weights.
+/// A model of images with few weights.
 pub fn small_config(method: MethodKind) -> ModelConfig {
     let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
@@ -30,52 +26,20 @@ pub fn position_config(method: MethodKind) -> ModelConfig {
     ModelConfig { encoder: EncoderConfig::Position(encoder), actions: 3, ..small_config(method) }
 }
 
-/// An agent in float64, so that gradients can be told from rounding.
-pub fn double_agent(config: ModelConfig) -> Agent {
-    let mut agent = Agent::new(config, 3);
-    agent.variables_mut().double();
-    agent
+/// Bytes of `count` images of noise, RGB8.
+pub fn noise_images(count: usize, seed: u64) -> Vec<u8> {
+    let mut bytes = vec![0; count * images::BYTES];
+    ChaCha8Rng::seed_from_u64(seed).fill(bytes.as_mut_slice());
+    bytes
 }
 
-/// Images of noise, `[B, 84, 84, 3]`.
-pub fn noise_images(batch: i64, seed: u64) -> Tensor {
-    let mut data = vec![0; batch as usize * images::BYTES];
-    ChaCha8Rng::seed_from_u64(seed).fill(data.as_mut_slice());
-    images::from_bytes(&data).unwrap()
-}
-
-/// Values in [-1, 1), float64.
-pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
+/// `count` values in [-1, 1).
+pub fn uniform(count: usize, seed: u64) -> Vec<f64> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let values: Vec<f64> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
-    Tensor::from_slice(&values).view(shape)
+    (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
 }
 
-/// Images, or positions.
-pub fn frames(tensor: &Tensor) -> Frames {
-    match tensor.kind() {
-        Kind::Uint8 => Frames::Images(Vec::try_from(tensor.flatten(0, -1)).unwrap()),
-        _ => {
-            let metres: Vec<f32> = Vec::try_from(tensor.to_kind(Kind::Float).flatten(0, -1)).unwrap();
-            Frames::Positions(metres.as_chunks().0.to_vec())
-        }
-    }
-}
-
-/// A batch of observations, each with a goal of its own.
-pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> Batch {
-    let count = observations.size()[0];
-    let rows = |first| Tensor::arange_start(first, first + count, (Kind::Int64, Device::Cpu));
-    Batch {
-        frames: frames(&Tensor::cat(&[observations, goals], 0)),
-        observations: rows(0),
-        goals: rows(count),
-        actions: actions.shallow_clone(),
-        mask: mask.shallow_clone(),
-    }
-}
-
-/// Features of the largest of these encoders; over more, float32's linear layer alone rounds by more than 1e-5.
+/// Maximum number of features of [`encoders`]; over more, float32's linear layer alone rounds by more than 1e-5.
 const FEATURES: i64 = 8192;
 
 /// Encoders of one or two convolutions: kernels of one to four strides, or of a pixel more; images that end with a tile, or not.

@@ -6,12 +6,10 @@
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
 use clap::Parser;
-use cpn::archive::{self, Tensors};
-use cpn::encoder::Precision;
+use cpn::archive::{self, Tensor, Tensors};
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
-use cpn::{Agent, EncoderConfig, Method, MethodKind, ModelConfig, Planner, checkpoint, images};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use cpn::{EncoderConfig, MethodKind, Model, ModelConfig, Precision, checkpoint, images};
+use engines::{Device, EngineKind};
 use serde_json::json;
 use std::io::{self, BufRead};
 use std::path::PathBuf;
@@ -20,7 +18,7 @@ use std::time::Instant;
 /// Distinct observations, over and over.
 const FRAMES: usize = 64;
 const SEED: u64 = 0;
-const DAMPING: f64 = 0.1;
+const DAMPING: f32 = 0.1;
 
 #[derive(Parser)]
 struct Args {
@@ -43,6 +41,12 @@ struct Args {
     updates: Option<i64>,
     #[arg(long, default_value_t = 1)]
     batch: usize,
+    /// Engine that plans.
+    #[arg(long, value_enum, default_value = "native")]
+    engine: EngineKind,
+    /// Device that plans.
+    #[arg(long, default_value_t)]
+    device: Device,
     #[arg(long, default_value_t = 1)]
     threads: usize,
     /// Encode in bfloat16, where the processor has instructions for it.
@@ -71,40 +75,34 @@ fn write(path: &PathBuf, args: &Args) {
         encoder.latent = args.latent.unwrap_or(encoder.latent);
     }
     config.validate().unwrap();
-    let agent = match &args.checkpoint {
-        Some(path) => checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().agent,
-        None => Agent::new(config, SEED),
+    let mut model = match &args.checkpoint {
+        Some(path) => checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().model,
+        None => Model::new(config, SEED),
     };
     if args.checkpoint.is_none() {
         // The steps that an untrained model predicts are so large that a plan longer than the paper's would be chaos, in which
         // no two programs agree.
-        for (name, mut weight) in agent.variables().variables() {
-            if name.starts_with("network.dynamics_1.") {
-                let _ = tch::no_grad(|| weight.g_mul_scalar_(DAMPING));
-            }
+        for (_, weight) in model.weights.iter_mut().filter(|(name, _)| name.starts_with("network.dynamics_1.")) {
+            let damped: Vec<f32> = weight.elements::<f32>().unwrap().iter().map(|value| value * DAMPING).collect();
+            *weight = Tensor::new(weight.shape(), &damped);
         }
     }
-    let noise = |seed| {
-        let mut bytes = vec![0; FRAMES * images::BYTES];
-        ChaCha8Rng::seed_from_u64(seed).fill(bytes.as_mut_slice());
-        images::from_bytes(&bytes).unwrap()
-    };
+    let size = images::SIZE as usize;
+    let noise = |seed| Tensor::new(&[FRAMES, size, size, 3], &testing::noise_images(FRAMES, seed));
     let mut tensors = Tensors::from([("frames".to_owned(), noise(1)), ("goals".to_owned(), noise(2))]);
-    let weights = agent.variables().variables().into_iter();
-    tensors.extend(weights.map(|(name, weight)| (format!("weight.{name}"), weight)));
-    std::fs::write(path, archive::to_bytes(&tensors, agent.config()).unwrap()).unwrap();
+    tensors.extend(model.weights.into_iter().map(|(name, weight)| (format!("weight.{name}"), weight)));
+    std::fs::write(path, archive::to_bytes(&tensors, &model.config).unwrap()).unwrap();
 }
 
-fn plan(path: &PathBuf, &Args { batch, threads, bfloat16, .. }: &Args) {
-    tch::set_num_threads(threads as i32);
+fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: &Args) {
     let (tensors, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();
-    let bytes = |name: &str| Vec::<u8>::try_from(tensors[name].flatten(0, -1)).unwrap();
+    let bytes = |name: &str| tensors[name].elements::<u8>().unwrap();
     let (frames, goals) = (bytes("frames"), bytes("goals"));
     let weights = tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t)));
-    let agent = Agent::new(config.clone(), SEED);
-    checkpoint::copy_weights(&weights.collect(), &agent).unwrap();
+    let model = Model { config, weights: weights.collect() };
     let precision = if bfloat16 { Precision::Bfloat16.where_faster() } else { Precision::Float32 };
-    let mut planner = Planner::new(agent, precision, threads);
+    let engine = engines::build(Some(engine), device, threads).unwrap();
+    let mut planner = engine.planner(&model, precision).unwrap();
     let observed = |bytes| -> Vec<_> { <[u8]>::chunks_exact(bytes, images::BYTES).map(Observed::Image).collect() };
     let (frames, x_gs) = (observed(&frames), planner.encode(&observed(&goals)));
     let (mut encoding, mut planning, mut batches) = (0.0, 0.0, 0);
@@ -115,7 +113,7 @@ fn plan(path: &PathBuf, &Args { batch, threads, bfloat16, .. }: &Args) {
         let encoded = Instant::now();
         let ends = xs.iter().zip(places.iter().map(|place| &x_gs[*place]));
         let queries: Vec<_> = ends.map(|(x, x_g)| Query { x, x_g, seed: 0, start: &[] }).collect();
-        let iterations = Iterations::Fixed(config.updates as usize);
+        let iterations = Iterations::Fixed(model.config.updates as usize);
         let plans = planner.plan(&queries, &mut Search { solver: Solver::Gradient, iterations });
         encoding += (encoded - started).as_secs_f64();
         planning += encoded.elapsed().as_secs_f64();

@@ -4,22 +4,27 @@
 
 mod common;
 
-use common::{double_agent, noise_images, paired, position_config, small_config, uniform};
-use cpn::inner_loop::InnerLoop;
-use cpn::loss::Batch;
-use cpn::neuromodulated::Neuromodulated;
-use cpn::{Agent, EncoderConfig, MethodKind, ModelConfig, positions};
+use common::{new_agent, noise_images, paired, uniform};
+use cpn::{EncoderConfig, MethodKind, Model, ModelConfig};
+use cpn_torch::inner_loop::InnerLoop;
+use cpn_torch::loss::TensorBatch;
+use cpn_torch::neuromodulated::Neuromodulated;
+use cpn_torch::{Agent, tensors};
 use tch::nn::{self, Module};
 use tch::{Device, Kind, Tensor};
+use testing::{position_config, small_config};
+
+/// Of float64, through the leaps of an untrained update.
+const ROUNDING: f64 = 1e-9;
 
 fn max_difference(a: &Tensor, b: &Tensor) -> f64 {
     (a - b).abs().max().double_value(&[])
 }
 
 /// A batch for the outer loss.
-fn batch(config: &ModelConfig, size: i64) -> Batch {
+fn batch(config: &ModelConfig, size: i64) -> TensorBatch {
     let inputs = |seed| match config.encoder {
-        EncoderConfig::Image(_) => noise_images(size, seed),
+        EncoderConfig::Image(_) => noise_images(size as usize, seed),
         EncoderConfig::Position(_) => uniform(&[size, 3], seed),
     };
     let (observations, goals) = (inputs(1), inputs(2));
@@ -35,7 +40,7 @@ fn outer_gradients_match_finite_differences() {
     let methods = MethodKind::ALL.into_iter();
     for config in methods.flat_map(|method| [small_config(method), position_config(method)]) {
         let method = config.method;
-        let agent = double_agent(config);
+        let agent = new_agent(config);
         let batch = batch(agent.config(), 3);
         let loss = || agent.outer_loss(&batch);
         loss().backward();
@@ -69,7 +74,7 @@ fn outer_gradients_match_finite_differences() {
 #[test]
 fn the_step_size_learns_through_the_update() {
     for method in [MethodKind::Upn, MethodKind::Cpn] {
-        let agent = double_agent(small_config(method));
+        let agent = new_agent(small_config(method));
         agent.outer_loss(&batch(agent.config(), 2)).backward();
         let gradient = agent.variables().variables()["step_size"].grad().double_value(&[]);
         assert!(gradient.abs() > 0.0, "{method}: the outer loss must depend on the inner update");
@@ -79,14 +84,14 @@ fn the_step_size_learns_through_the_update() {
 #[test]
 fn a_plan_does_not_depend_on_its_batch() {
     for method in MethodKind::ALL {
-        let agent = double_agent(small_config(method));
+        let agent = new_agent(small_config(method));
         let (x, x_g) = (uniform(&[7, 6], 1), uniform(&[7, 6], 2));
         let together = agent.plan(&x, &x_g);
         for row in 0..7 {
             let alone = agent.plan(&x.narrow(0, row, 1), &x_g.narrow(0, row, 1));
-            assert!(max_difference(&alone.actions, &together.actions.narrow(0, row, 1)) < 1e-12, "{method}");
+            assert!(max_difference(&alone.actions, &together.actions.narrow(0, row, 1)) < ROUNDING, "{method}");
             for (a, b) in alone.inner_losses.iter().zip(&together.inner_losses) {
-                assert!(max_difference(a, &b.narrow(0, row, 1)) < 1e-12, "{method}");
+                assert!(max_difference(a, &b.narrow(0, row, 1)) < ROUNDING, "{method}");
             }
         }
     }
@@ -94,7 +99,7 @@ fn a_plan_does_not_depend_on_its_batch() {
 
 #[test]
 fn training_and_serving_plan_alike() {
-    let agent = double_agent(small_config(MethodKind::Cpn));
+    let agent = new_agent(small_config(MethodKind::Cpn));
     let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
     let inner_loop = InnerLoop { updates: 3, ..agent.inner_loop() };
     let served = inner_loop.plan(&x, &x_g);
@@ -105,7 +110,7 @@ fn training_and_serving_plan_alike() {
 
 #[test]
 fn without_updates_the_plan_is_the_policys_rollout() {
-    let agent = double_agent(small_config(MethodKind::Cpn));
+    let agent = new_agent(small_config(MethodKind::Cpn));
     let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
     let planned = InnerLoop { updates: 0, ..agent.inner_loop() }.plan(&x, &x_g).actions;
     let network = agent.inner_loop().network;
@@ -121,7 +126,7 @@ fn without_updates_the_plan_is_the_policys_rollout() {
 #[test]
 fn a_small_update_lowers_the_inner_loss() {
     for method in [MethodKind::Upn, MethodKind::Cpn] {
-        let agent = double_agent(small_config(method));
+        let agent = new_agent(small_config(method));
         let step_size = Tensor::from(1e-3);
         let inner_loop = InnerLoop { updates: 5, step_size: &step_size, ..agent.inner_loop() };
         let losses = inner_loop.plan(&uniform(&[4, 6], 1), &uniform(&[4, 6], 2)).inner_losses;
@@ -151,7 +156,7 @@ fn an_open_neuromodulated_layer_is_linear() {
 #[test]
 fn each_method_sees_what_it_should() {
     for method in MethodKind::ALL {
-        let agent = double_agent(small_config(method));
+        let agent = new_agent(small_config(method));
         let [x, goal_a, goal_b] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
         let change = max_difference(&agent.plan(&x, &goal_a).actions, &agent.plan(&x, &goal_b).actions);
         assert_eq!(change > 0.0, method != MethodKind::Bc, "{method}: only BC ignores the goal");
@@ -162,7 +167,7 @@ fn each_method_sees_what_it_should() {
 
 #[test]
 fn steps_past_the_demonstration_do_not_count() {
-    let agent = double_agent(small_config(MethodKind::Cpn));
+    let agent = new_agent(small_config(MethodKind::Cpn));
     let batch = batch(agent.config(), 2);
     let _ = batch.mask.get(1).narrow(0, 2, 3).fill_(0.0);
     let loss = || agent.outer_loss(&batch).double_value(&[]);
@@ -177,7 +182,7 @@ fn positions_are_standardised() {
     let embed = |centre_mm, scale_mm, position| {
         let encoder = EncoderConfig::position(centre_mm, scale_mm);
         let config = ModelConfig { encoder, ..position_config(MethodKind::Cpn) };
-        Agent::new(config, 0).encode(&positions::from_metres(&[position]))
+        Agent::new(&Model::new(config, 0), Device::Cpu).encode(&tensors::from_positions(&[position]))
     };
     let (near, far) = (embed([0; 3], 100, [0.1, -0.05, 0.02]), embed([700, 200, -300], 200, [0.9, 0.1, -0.26]));
     assert!(max_difference(&near, &far) < 1e-5);
@@ -190,10 +195,10 @@ fn every_preset_builds() {
         for method in MethodKind::ALL {
             let config = ModelConfig { encoder: encoder.clone(), ..ModelConfig::paper(method) };
             config.validate().unwrap();
-            let agent = Agent::new(config, 0);
+            let agent = Agent::new(&Model::new(config, 0), Device::Cpu);
             let inputs = match encoder {
                 EncoderConfig::Image(_) => noise_images(2, 0),
-                EncoderConfig::Position(_) => positions::from_metres(&[[0.5, 0.0, 0.2]; 2]),
+                EncoderConfig::Position(_) => tensors::from_positions(&[[0.5, 0.0, 0.2]; 2]),
             };
             let x = agent.encode(&inputs);
             assert_eq!(x.size(), [2, encoder.latent()]);

@@ -1,0 +1,43 @@
+//! The outer loop: behaviour cloning of the planned actions, through the inner loop.
+
+use crate::tensors;
+use cpn::Batch;
+use tch::{Device, Kind, Tensor};
+
+/// A batch as tensors.
+#[derive(Debug)]
+pub struct TensorBatch {
+    /// Distinct images `[F, 84, 84, 3]`, bytes, or positions `[F, 3]`, metres.
+    pub frames: Tensor,
+    /// Index of each sample's observation among the frames, `[B]` integers.
+    pub observations: Tensor,
+    /// Index of each sample's goal among the frames, `[B]` integers.
+    pub goals: Tensor,
+    /// The demonstrated actions that follow, `[B, H, A]`; 0 past the demonstration's end.
+    pub actions: Tensor,
+    /// 1 for an action within the demonstration, else 0, `[B, H]`.
+    pub mask: Tensor,
+}
+
+impl TensorBatch {
+    /// A batch for plans of H = `horizon` steps, on a device.
+    pub fn new(batch: &Batch, horizon: i64, device: Device) -> Self {
+        let samples = batch.observations.len() as i64;
+        let on_device = |tensor: Tensor| tensor.to_device(device);
+        Self {
+            frames: on_device(tensors::from_frames(&batch.frames)),
+            observations: on_device(tensors::from_indices(&batch.observations)),
+            goals: on_device(tensors::from_indices(&batch.goals)),
+            actions: on_device(Tensor::from_slice(&batch.actions).view([samples, horizon, -1])),
+            mask: on_device(Tensor::from_slice(&batch.mask).view([samples, horizon])),
+        }
+    }
+}
+
+/// Mean squared error between planned and demonstrated actions, both `[B, H, A]`, over the steps that the demonstration
+/// still has: `mask` `[B, H]` is 1 there and 0 past its end.
+pub fn behaviour_cloning(planned: &Tensor, demonstrated: &Tensor, mask: &Tensor) -> Tensor {
+    let actions = planned.size()[2] as f64;
+    let squared = (planned - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);
+    (squared * mask).sum(None::<Kind>) / (mask.sum(None::<Kind>) * actions)
+}

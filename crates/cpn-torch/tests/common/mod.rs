@@ -1,0 +1,43 @@
+//! Agents and batches for tests.
+
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use cpn::{Model, ModelConfig};
+use cpn_torch::loss::TensorBatch;
+use cpn_torch::{Agent, tensors};
+use tch::{Device, Kind, Tensor};
+
+/// An agent in float64, so that gradients can be told from rounding.
+pub fn double_agent(model: &Model) -> Agent {
+    let mut agent = Agent::new(model, Device::Cpu);
+    agent.variables_mut().double();
+    agent
+}
+
+/// A double agent with initial weights.
+pub fn new_agent(config: ModelConfig) -> Agent {
+    double_agent(&Model::new(config, 3))
+}
+
+/// Images of noise, `[B, 84, 84, 3]`.
+pub fn noise_images(batch: usize, seed: u64) -> Tensor {
+    tensors::from_images(&testing::noise_images(batch, seed))
+}
+
+/// Values in [-1, 1), float64.
+pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
+    Tensor::from_slice(&testing::uniform(shape.iter().product::<i64>() as usize, seed)).view(shape)
+}
+
+/// A batch of observations, each with a goal of its own.
+pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> TensorBatch {
+    let count = observations.size()[0];
+    let rows = |first| Tensor::arange_start(first, first + count, (Kind::Int64, Device::Cpu));
+    TensorBatch {
+        frames: Tensor::cat(&[observations, goals], 0),
+        observations: rows(0),
+        goals: rows(count),
+        actions: actions.shallow_clone(),
+        mask: mask.shallow_clone(),
+    }
+}

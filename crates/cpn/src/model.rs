@@ -1,0 +1,191 @@
+//! A model: its configuration and its weights.
+
+use crate::archive::{Tensor, Tensors};
+use crate::config::{EncoderConfig, ImageEncoderConfig, ModelConfig, PositionEncoderConfig};
+use crate::{images, positions};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Initial bias of the attenuation networks' outputs: attenuation starts near 1 (sigmoid(2) = 0.88), so that training starts from
+/// an almost plain linear layer.
+const GATE_BIAS: f32 = 2.0;
+
+/// Encoder, g_θ and the step size of the inner loop, as numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model {
+    /// Sizes and method.
+    pub config: ModelConfig,
+    /// Weights by their names in a checkpoint, float32, in the shapes of [`parameters`].
+    pub weights: Tensors,
+}
+
+/// A weight of a model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// Name in a checkpoint.
+    pub name: String,
+    /// Shape; empty for a scalar.
+    pub shape: Vec<usize>,
+    /// Distribution of the initial values.
+    pub init: Init,
+}
+
+/// Distribution of a weight's initial values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Init {
+    /// One value.
+    Constant(f32),
+    /// Uniform in ± this.
+    Uniform(f32),
+}
+
+impl Model {
+    /// A freshly initialised model of a valid configuration, the same for the same seed on every machine.
+    pub fn new(config: ModelConfig, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut draw = |init| match init {
+            Init::Constant(value) => value,
+            Init::Uniform(bound) => rng.random_range(-bound..=bound),
+        };
+        let mut weight = |Parameter { name, shape, init }: Parameter| {
+            let elements: Vec<f32> = (0..shape.iter().product()).map(|_| draw(init)).collect();
+            (name, Tensor::new(&shape, &elements))
+        };
+        let weights = parameters(&config).into_iter().map(&mut weight).collect();
+        Self { config, weights }
+    }
+}
+
+/// The weights of a valid configuration.
+pub fn parameters(config: &ModelConfig) -> Vec<Parameter> {
+    let mut list = Parameters(Vec::new());
+    list.encoder(&config.encoder);
+    list.network(config);
+    list.push("step_size", &[], Init::Constant(1.0));
+    list.0
+}
+
+/// Weights in the order of their initialisation.
+struct Parameters(Vec<Parameter>);
+
+impl Parameters {
+    fn push(&mut self, name: &str, shape: &[i64], init: Init) {
+        let shape = shape.iter().map(|&size| size as usize).collect();
+        self.0.push(Parameter { name: name.to_owned(), shape, init });
+    }
+
+    /// A weight before a rectified linear unit, by He et al. (2015): uniform, of variance 2 / fan-in.
+    fn weight(&mut self, name: &str, shape: &[i64]) {
+        let fan_in: i64 = shape[1..].iter().product();
+        self.push(&format!("{name}.weight"), shape, Init::Uniform((6.0 / fan_in as f32).sqrt()));
+    }
+
+    fn bias(&mut self, name: &str, size: i64, init: Init) {
+        self.push(&format!("{name}.bias"), &[size], init);
+    }
+
+    fn linear(&mut self, name: &str, inputs: i64, outputs: i64) {
+        self.weight(name, &[outputs, inputs]);
+        self.bias(name, outputs, Init::Uniform(1.0 / (inputs as f32).sqrt()));
+    }
+
+    fn encoder(&mut self, config: &EncoderConfig) {
+        let features = match config {
+            EncoderConfig::Image(config) => self.image_features(config),
+            EncoderConfig::Position(config) => self.position_features(config),
+        };
+        let latent = config.latent();
+        self.linear("encoder.linear", features, latent);
+        if config.layer_norm() {
+            self.push("encoder.norm.weight", &[latent], Init::Constant(1.0));
+            self.bias("encoder.norm", latent, Init::Constant(0.0));
+        }
+    }
+
+    /// The convolutions; returns F, the number of features.
+    fn image_features(&mut self, config: &ImageEncoderConfig) -> i64 {
+        let mut channels = images::CHANNELS;
+        for (i, conv) in config.convolutions.iter().enumerate() {
+            let name = format!("encoder.conv.{i}");
+            self.weight(&name, &[conv.channels, channels, conv.kernel, conv.kernel]);
+            self.bias(&name, conv.channels, Init::Constant(0.0));
+            channels = conv.channels;
+        }
+        let size = config.output_size().expect("validated configuration");
+        channels * size * size
+    }
+
+    /// The linear layers; returns F, the number of features.
+    fn position_features(&mut self, config: &PositionEncoderConfig) -> i64 {
+        let mut width = positions::SIZE;
+        for (i, &outputs) in config.layers.iter().enumerate() {
+            self.linear(&format!("encoder.layer.{i}"), width, outputs);
+            width = outputs;
+        }
+        width
+    }
+
+    /// g_θ: the trunk, the policy branch and, for methods that plan, the dynamics branch.
+    fn network(&mut self, config: &ModelConfig) {
+        let ModelConfig { method, hidden, actions, .. } = *config;
+        let latent = config.encoder.latent();
+        let context = if method.is_goal_conditioned() { latent } else { 0 };
+
+        self.dense("network.trunk", latent + context, hidden, config);
+        self.dense("network.policy_0", hidden, hidden, config);
+        self.dense("network.policy_1", hidden, actions, config);
+        if method.plans() {
+            self.dense("network.dynamics_0", hidden + actions, hidden, config);
+            self.dense("network.dynamics_1", hidden, latent, config);
+        }
+    }
+
+    /// A fully connected layer, with its attenuation networks if it is neuromodulated.
+    fn dense(&mut self, name: &str, inputs: i64, outputs: i64, config: &ModelConfig) {
+        self.linear(name, inputs, outputs);
+        if config.method.is_neuromodulated() {
+            for (gate, attenuated) in [("u", outputs * inputs), ("v", outputs)] {
+                self.linear(&format!("{name}.{gate}.hidden"), inputs, config.gate_hidden);
+                let output = format!("{name}.{gate}.output");
+                self.weight(&output, &[attenuated, config.gate_hidden]);
+                self.bias(&output, attenuated, Init::Constant(GATE_BIAS));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::MethodKind;
+
+    #[test]
+    fn weights_follow_their_seed_and_stay_within_their_bounds() {
+        for method in MethodKind::ALL {
+            let config = ModelConfig::paper(method);
+            let model = Model::new(config.clone(), 3);
+            assert_eq!(model, Model::new(config.clone(), 3));
+            assert_ne!(model, Model::new(config.clone(), 4));
+            for Parameter { name, shape, init } in parameters(&config) {
+                let tensor = &model.weights[&name];
+                assert_eq!(tensor.shape(), shape, "{name}");
+                let elements: Vec<f32> = tensor.elements().expect("float32");
+                match init {
+                    Init::Constant(value) => assert!(elements.iter().all(|element| *element == value), "{name}"),
+                    Init::Uniform(bound) => {
+                        let largest = elements.iter().fold(0.0f32, |most, element| most.max(element.abs()));
+                        assert!(largest <= bound && largest > bound / 2.0, "{name}: {largest} of {bound}");
+                    }
+                }
+            }
+        }
+    }
+
+    /// A change here changes all trained weights.
+    #[test]
+    fn the_stream_of_initial_values_is_fixed() {
+        let model = Model::new(ModelConfig::paper(MethodKind::Cpn), 0);
+        let elements: Vec<f32> = model.weights["network.trunk.weight"].elements().expect("float32");
+        assert_eq!(elements[..2], [-0.12922287, 0.17566977]);
+    }
+}
