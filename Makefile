@@ -4,11 +4,14 @@ SHELL := bash
 TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
+EXAMPLES := examples/.venv
 EXPORT := export/.venv
 BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
+# Sources of cpn-messages, a dependency of several environments.
+MESSAGES := messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
 COMPOSE ?= docker-compose
 # All code in Python, as seen from sim-worker, whose settings hold for it.
 PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tests/kubernetes tests/openpi tests/stack)
@@ -20,7 +23,7 @@ export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
-setup: system .libtorch/build-version $(WORKER)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
+setup: system .libtorch/build-version $(WORKER)/.ready $(EXAMPLES)/.ready ## Fetch libtorch, the graphics libraries and the Python packages
 
 system:
 	@scripts/setup-system.sh
@@ -32,11 +35,15 @@ $(UV): | system
 .libtorch/build-version: scripts/setup-libtorch.sh | $(UV)
 	PATH="$(TOOLS)/bin:$$PATH" scripts/setup-libtorch.sh
 
-$(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/scripts/generate_proto.py $(wildcard proto/cpn/v1/*.proto) | $(UV)
-	cd sim-worker && $(UV) sync --quiet --locked --all-extras && $(UV) run --quiet scripts/generate_proto.py
+$(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock $(MESSAGES) | $(UV)
+	cd sim-worker && $(UV) sync --quiet --locked --all-extras
 	touch $@
 
-$(EXPORT)/.ready: export/pyproject.toml export/uv.lock | $(UV)
+$(EXAMPLES)/.ready: examples/pyproject.toml examples/uv.lock $(MESSAGES) | $(UV)
+	cd examples && $(UV) sync --quiet --locked
+	touch $@
+
+$(EXPORT)/.ready: export/pyproject.toml export/uv.lock $(MESSAGES) | $(UV)
 	cd export && $(UV) sync --quiet --locked
 	touch $@
 
@@ -44,7 +51,7 @@ $(BENCH)/.ready: benches/peers/pyproject.toml benches/peers/uv.lock | $(UV)
 	cd benches/peers && $(UV) sync --quiet --locked
 	touch $@
 
-$(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock | $(UV)
+$(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock $(MESSAGES) | $(UV)
 	cd tests/openpi && $(UV) sync --quiet --locked
 	touch $@
 
@@ -52,7 +59,7 @@ $(KUBERNETES)/.ready: tests/kubernetes/pyproject.toml tests/kubernetes/uv.lock |
 	cd tests/kubernetes && $(UV) sync --quiet --locked
 	touch $@
 
-$(STACK)/.ready: tests/stack/pyproject.toml tests/stack/uv.lock | $(UV)
+$(STACK)/.ready: tests/stack/pyproject.toml tests/stack/uv.lock $(MESSAGES) | $(UV)
 	cd tests/stack && $(UV) sync --quiet --locked
 	touch $@
 
@@ -161,4 +168,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target $(WORKER) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) .libtorch
+	rm -rf target fuzz/target $(WORKER) $(EXAMPLES) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) .libtorch

@@ -21,17 +21,13 @@ WORKDIR /src/sim-worker
 
 # Dependencies first; `--build-arg EXTRAS="--extra jenga"` adds the Jenga scene's arm.
 ARG EXTRAS=
+COPY messages/pyproject.toml /src/messages/
 COPY sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/README.md ./
-RUN /uv/bin/uv sync --quiet --locked --no-dev --no-install-project ${EXTRAS}
+RUN /uv/bin/uv sync --quiet --locked --no-dev --no-install-local ${EXTRAS}
 
-# Messages, by a generator of the locked version in an environment of its own.
-RUN /uv/bin/uv export --quiet --locked --only-dev --no-emit-project --output-file /generator.txt \
- && /uv/bin/uv venv --quiet /generator \
- && /uv/bin/uv pip install --quiet --python /generator/bin/python --constraint /generator.txt grpcio-tools
+# The messages, generated when their package is built, and the worker.
 COPY proto /src/proto
-COPY sim-worker/scripts scripts
-RUN mkdir -p src && /generator/bin/python scripts/generate_proto.py
-
+COPY messages /src/messages
 COPY sim-worker/src src
 RUN /uv/bin/uv sync --quiet --locked --no-dev --no-editable ${EXTRAS}
 

@@ -1,6 +1,6 @@
 """Asks a planner over gRPC for a plan towards a registered picture.
 
-sim-worker/.venv/bin/python examples/plan_grpc.py examples/goal.png examples/frame.png
+examples/.venv/bin/python examples/plan_grpc.py examples/goal.png examples/frame.png
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Asks a planner over zenoh for a plan towards a picture.
 
-sim-worker/.venv/bin/python examples/plan_zenoh.py examples/goal.png examples/frame.png
+examples/.venv/bin/python examples/plan_zenoh.py examples/goal.png examples/frame.png
 """
 
 import sys

@@ -1,29 +1,14 @@
 import hashlib
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from cpn.v1 import demonstration_pb2
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message_factory import GetMessages
-from grpc_tools import protoc
 from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
 
-PROTO = Path(__file__).resolve().parents[2] / "proto"
 SIZE, STATE_SIZE, ACTION_SIZE = 84, 39, 4
-
-
-def _messages() -> dict[str, Any]:
-    with tempfile.NamedTemporaryFile() as file:
-        options = [f"-I{PROTO}", f"--descriptor_set_out={file.name}", "--include_imports"]
-        assert protoc.main(["", *options, "cpn/v1/demonstration.proto"]) == 0
-        return GetMessages(FileDescriptorSet.FromString(file.read()).file)
-
-
-MESSAGES = _messages()
 
 
 @dataclass
@@ -73,7 +58,7 @@ class Sample:
         for t, action in enumerate(actions):
             for part in (self.frames[t], action, self.states[t], self.rewards[t], self.successes[t]):
                 digest.update(part.tobytes())
-        header = MESSAGES["cpn.v1.RecordedEpisode"](
+        header = demonstration_pb2.RecordedEpisode(
             episode_id=self.episode_id,
             variation={"task": self.task, "seed": self.seed},
             render_spec=self.render_spec,
@@ -95,7 +80,7 @@ class Sample:
                     data=self.frames[t].tobytes(),
                 )
                 frame.timestamp.FromNanoseconds(time)
-                step = MESSAGES["cpn.v1.RecordedStep"](
+                step = demonstration_pb2.RecordedStep(
                     step=t,
                     action={"values": action} if len(action) else None,
                     state=self.states[t],

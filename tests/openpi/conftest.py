@@ -1,18 +1,14 @@
 import os
 import re
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message_factory import GetMessages
-from grpc_tools import protoc
+from cpn.v1 import planner_pb2_grpc, types_pb2
 from numpy.typing import NDArray
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from PIL import Image
@@ -21,32 +17,15 @@ ROOT = Path(__file__).resolve().parents[2]
 PLANNER = os.environ.get("CPN_PLANNER", str(ROOT / "target/debug/cpn-planner"))
 
 
-def _messages() -> dict[str, Any]:
-    with tempfile.NamedTemporaryFile() as file:
-        options = [f"-I{ROOT}/proto", f"--descriptor_set_out={file.name}", "--include_imports"]
-        assert protoc.main(["", *options, "cpn/v1/planner.proto"]) == 0
-        return GetMessages(FileDescriptorSet.FromString(file.read()).file)
-
-
-MESSAGES = _messages()
-
-
 @dataclass
 class Planner:
     """A planner's process with the shipped checkpoints, where it listens."""
 
     openpi_port: int
-    grpc: grpc.Channel
+    grpc: planner_pb2_grpc.PlannerServiceStub
 
     def connect(self, **options: str) -> WebsocketClientPolicy:
         return WebsocketClientPolicy("127.0.0.1", self.openpi_port, **options)
-
-    def call(self, method: str, **fields: object) -> Any:
-        """What it answers over gRPC."""
-        request, response = (MESSAGES[f"cpn.v1.{method}{kind}"] for kind in ("Request", "Response"))
-        path = f"/cpn.v1.PlannerService/{method}"
-        call = self.grpc.unary_unary(path, request.SerializeToString, response.FromString)
-        return call(request(**fields), timeout=60)
 
 
 @pytest.fixture(scope="session")
@@ -62,7 +41,7 @@ def planner() -> Iterator[Planner]:
         else:
             pytest.fail(f"no planner:\n{log}")
         with grpc.insecure_channel(ready[1]) as channel:
-            yield Planner(int(ready[2]), channel)
+            yield Planner(int(ready[2]), planner_pb2_grpc.PlannerServiceStub(channel))
         process.terminate()
         assert process.wait(30) == 0
 
@@ -75,6 +54,6 @@ def pictures() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     return frame, goal
 
 
-def message(picture: NDArray[np.uint8]) -> Any:
+def message(picture: NDArray[np.uint8]) -> types_pb2.Image:
     """A picture as the planner's own clients send it."""
-    return MESSAGES["cpn.v1.Image"](height=84, width=84, format="PIXEL_FORMAT_RGB8", data=picture.tobytes())
+    return types_pb2.Image(height=84, width=84, format=types_pb2.PIXEL_FORMAT_RGB8, data=picture.tobytes())

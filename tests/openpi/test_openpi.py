@@ -7,6 +7,7 @@ import urllib.request
 
 import numpy as np
 import pytest
+from cpn.v1 import planner_pb2
 from numpy.typing import NDArray
 from openpi_client.action_chunk_broker import ActionChunkBroker
 from openpi_client.image_tools import resize_with_pad
@@ -21,7 +22,8 @@ MODELS = ["bc", "cpn", "random", "te-bc", "upn"]
 @pytest.mark.parametrize("registered", [False, True])
 def test_the_actions_are_those_of_grpc(planner: Planner, pictures: Pictures, model: str, registered: bool) -> None:
     frame, goal = pictures
-    plan = planner.call("Plan", model=model, goal_image=message(goal), observation=message(frame), seed=7)
+    request = planner_pb2.PlanRequest(model=model, goal_image=message(goal), observation=message(frame), seed=7)
+    plan = planner.grpc.Plan(request, timeout=60)
     towards = {"goal/id": plan.goal_id} if registered else {"goal/image": goal}
     got = planner.connect().infer({"model": model, "observation/image": frame, "seed": 7, **towards})
     expected = np.clip(np.array([action.values for action in plan.actions], np.float32), -1, 1)
@@ -36,7 +38,7 @@ def test_the_actions_are_those_of_grpc(planner: Planner, pictures: Pictures, mod
 def test_the_metadata_tell_what_is_served(planner: Planner) -> None:
     metadata = planner.connect(api_key="of no use here").get_server_metadata()
     assert metadata["image_shape"] == [84, 84, 3]
-    served = planner.call("ListModels").models
+    served = planner.grpc.ListModels(planner_pb2.ListModelsRequest(), timeout=60).models
     assert list(metadata["models"]) == [info.name for info in served] == MODELS
     for info, told in zip(served, metadata["models"].values(), strict=True):
         assert told == {

@@ -4,15 +4,17 @@ import os
 import re
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
 import pytest
+from cpn.v1 import planner_pb2, planner_pb2_grpc
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.exceptions import InvalidStatus
 
-from conftest import MESSAGES, PLANNER, ROOT
+from conftest import PLANNER, ROOT
 
 CERTS = os.environ.get("CPN_CERTS", str(ROOT / "target/debug/cpn-certs"))
 
@@ -29,16 +31,14 @@ class SecurePlanner:
     def openpi(self, api_key: str | None) -> WebsocketClientPolicy:
         return WebsocketClientPolicy("wss://localhost", self.openpi_port, api_key=api_key)
 
-    def call(self, identity: str, method: str, **fields: object) -> object:
-        """What it answers over gRPC to the certificate of an identity."""
+    @contextmanager
+    def grpc(self, identity: str) -> Iterator[planner_pb2_grpc.PlannerServiceStub]:
+        """Its gRPC service, called with the certificate of an identity."""
         folder = self.files / identity
         files = [(folder / name).read_bytes() for name in ("ca.pem", "private-key.pem", "certificate.pem")]
         credentials = grpc.ssl_channel_credentials(*files)
-        request, response = (MESSAGES[f"cpn.v1.{method}{kind}"] for kind in ("Request", "Response"))
-        path = f"/cpn.v1.PlannerService/{method}"
         with grpc.secure_channel(f"localhost:{self.grpc_port}", credentials) as channel:
-            call = channel.unary_unary(path, request.SerializeToString, response.FromString)
-            return call(request(**fields), timeout=60)
+            yield planner_pb2_grpc.PlannerServiceStub(channel)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,9 @@ def test_openpis_client_trusts_the_authority_and_shows_its_key(
 
 
 def test_grpcs_client_may_do_what_its_role_may(secure: SecurePlanner) -> None:
-    assert [info.name for info in secure.call("client", "ListModels").models] == ["random"]  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(grpc.RpcError) as refused:
-        secure.call("client", "LoadModel", model="m", file="m.safetensors")
+    with secure.grpc("client") as planner:
+        served = planner.ListModels(planner_pb2.ListModelsRequest(), timeout=60).models
+        assert [info.name for info in served] == ["random"]
+        with pytest.raises(grpc.RpcError) as refused:
+            planner.LoadModel(planner_pb2.LoadModelRequest(model="m", file="m.safetensors"), timeout=60)
     assert refused.value.code() == grpc.StatusCode.PERMISSION_DENIED  # pyright: ignore[reportAttributeAccessIssue]

@@ -22,9 +22,9 @@ fn the_readme_shows_one_example_and_links_the_others() {
     }
 }
 
-/// Runs an example in the sim-worker's environment against a planner.
+/// Runs an example in the examples' environment against a planner.
 async fn run(example: &str, endpoint: String) {
-    let python = Path::new(ROOT).join("sim-worker/.venv/bin/python");
+    let python = Path::new(ROOT).join("examples/.venv/bin/python");
     let mut command = Command::new(python);
     command.current_dir(ROOT).args([example, "examples/goal.png", "examples/frame.png", &endpoint]);
     let output = tokio::task::spawn_blocking(move || command.output().unwrap()).await.unwrap();

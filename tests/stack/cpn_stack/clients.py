@@ -1,15 +1,13 @@
 """Clients of the stack that run on the host."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import grpc
 import zenoh
-
-from cpn_stack.messages import decode, message
-
-PLANNER = "/cpn.v1.PlannerService/"
+from cpn.v1 import planner_pb2_grpc
 
 
 def open_zenoh(endpoint: str, certificates: Path | None, ca: Path | None = None) -> zenoh.Session:
@@ -38,21 +36,12 @@ def open_zenoh(endpoint: str, certificates: Path | None, ca: Path | None = None)
     return zenoh.open(config)
 
 
-def channel(port: int, certificates: Path) -> grpc.Channel:
-    """gRPC with a client certificate."""
+@contextmanager
+def open_grpc(port: int, certificates: Path) -> Iterator[planner_pb2_grpc.PlannerServiceStub]:
+    """A planner's gRPC service, called with a client certificate."""
     ca, key, certificate = (
         (certificates / name).read_bytes() for name in ("ca.pem", "private-key.pem", "certificate.pem")
     )
-    return grpc.secure_channel(f"localhost:{port}", grpc.ssl_channel_credentials(ca, key, certificate))
-
-
-def call_planner(open_channel: grpc.Channel, method: str, **fields: object) -> Any:
-    """What a planner answers.
-
-    Raises:
-        grpc.RpcError: If it refuses.
-    """
-    call = open_channel.unary_unary(
-        PLANNER + method, response_deserializer=lambda payload: decode(f"{method}Response", payload)
-    )
-    return call(message(f"{method}Request", **fields).SerializeToString(), timeout=60)
+    credentials = grpc.ssl_channel_credentials(ca, key, certificate)
+    with grpc.secure_channel(f"localhost:{port}", credentials) as channel:
+        yield planner_pb2_grpc.PlannerServiceStub(channel)

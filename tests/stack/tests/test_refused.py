@@ -6,14 +6,17 @@ from pathlib import Path
 import grpc
 import pytest
 import zenoh
+from cpn.v1 import planner_pb2
 
 from cpn_stack import clients
 from cpn_stack.docker import docker, inspect, logs, read_folder, wait_until, write_file
-from cpn_stack.messages import decode, message
 from cpn_stack.metrics import Metrics
 from cpn_stack.stack import ROOT, USER, Stack
 
 Certificates = Callable[[str], Path]
+
+LIST_MODELS = planner_pb2.ListModelsRequest()
+TIMEOUT_SECONDS = 60
 
 
 def test_second_planner_of_a_name(stack: Stack) -> None:
@@ -69,29 +72,30 @@ def test_wrong_authority(stack: Stack, certificates: Certificates, strangers: Pa
         clients.open_zenoh(endpoint, strangers, ca=certificates("operator"))
     router_log_grows(stack, "invalid peer certificate", before)
 
-    with clients.channel(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as channel:
-        assert clients.call_planner(channel, "ListModels").models
+    with clients.open_grpc(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as planner:
+        assert planner.ListModels(LIST_MODELS, timeout=TIMEOUT_SECONDS).models
     (strangers / "ca.pem").write_bytes((certificates("operator") / "ca.pem").read_bytes())
     before = stack.logs("planner-0").count("a TLS handshake failed")
-    with clients.channel(stack.ports["CPN_PORT_PLANNER_0"], strangers) as channel:
+    with clients.open_grpc(stack.ports["CPN_PORT_PLANNER_0"], strangers) as planner:
         with pytest.raises(grpc.RpcError) as refusal:
-            clients.call_planner(channel, "ListModels")
+            planner.ListModels(LIST_MODELS, timeout=TIMEOUT_SECONDS)
         assert "StatusCode.UNAVAILABLE" in str(refusal.value)
     wait_until("it is logged", lambda: stack.logs("planner-0").count("a TLS handshake failed") > before)
 
 
 def digests(stack: Stack, certificates: Certificates) -> dict[str, str]:
-    with clients.channel(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as channel:
-        return {model.name: model.digest for model in clients.call_planner(channel, "ListModels").models}
+    with clients.open_grpc(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as planner:
+        served = planner.ListModels(LIST_MODELS, timeout=TIMEOUT_SECONDS)
+        return {model.name: model.digest for model in served.models}
 
 
 def test_load_model_by_a_client(stack: Stack, certificates: Certificates, metrics: list[Metrics]) -> None:
     served = digests(stack, certificates)
-    fields = {"model": "cpn", "file": "bc.safetensors"}
+    request = planner_pb2.LoadModelRequest(model="cpn", file="bc.safetensors")
     before = metrics[0].total("cpn_access_refused_total") or 0
-    with clients.channel(stack.ports["CPN_PORT_PLANNER_0"], certificates("client")) as channel:
+    with clients.open_grpc(stack.ports["CPN_PORT_PLANNER_0"], certificates("client")) as planner:
         with pytest.raises(grpc.RpcError) as refusal:
-            clients.call_planner(channel, "LoadModel", **fields)
+            planner.LoadModel(request, timeout=TIMEOUT_SECONDS)
         assert "StatusCode.PERMISSION_DENIED" in str(refusal.value)
     assert metrics[0].total("cpn_access_refused_total") == before + 1
     assert any(
@@ -100,9 +104,10 @@ def test_load_model_by_a_client(stack: Stack, certificates: Certificates, metric
 
     endpoint = f"tls/localhost:{stack.ports['CPN_PORT_ROUTER']}"
     with clients.open_zenoh(endpoint, certificates("client")) as session:
-        plan = session.get("cpn/@v1/planner/planner-0/list_models", payload=b"", timeout=10)
-        assert any(reply.ok and decode("ListModelsResponse", reply.ok.payload.to_bytes()).models for reply in plan)
-        payload = message("LoadModelRequest", **fields).SerializeToString()
+        replies = session.get("cpn/@v1/planner/planner-0/list_models", payload=b"", timeout=10)
+        answers = [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
+        assert any(planner_pb2.ListModelsResponse.FromString(answer).models for answer in answers)
+        payload = request.SerializeToString()
         replies = list(session.get("cpn/@v1/planner/planner-0/load_model", payload=payload, timeout=10))
         assert not any(reply.ok for reply in replies)
     assert digests(stack, certificates) == served
@@ -122,9 +127,9 @@ def test_unsigned_checkpoint(stack: Stack, certificates: Certificates, metrics: 
     served = digests(stack, certificates)
     weights = (ROOT / "models/bc.safetensors").read_bytes()
     before = metrics[0].total("cpn_planner_checkpoints_refused_total") or 0
-    with clients.channel(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as channel:
+    with clients.open_grpc(stack.ports["CPN_PORT_PLANNER_0"], certificates("operator")) as planner:
         with pytest.raises(grpc.RpcError) as refusal:
-            clients.call_planner(channel, "LoadModel", model="cpn", checkpoint=weights)
+            planner.LoadModel(planner_pb2.LoadModelRequest(model="cpn", checkpoint=weights), timeout=TIMEOUT_SECONDS)
         assert "StatusCode.FAILED_PRECONDITION" in str(refusal.value)
         assert "signature: expected " in str(refusal.value)
 
