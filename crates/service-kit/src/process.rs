@@ -13,7 +13,7 @@ const OPTIONS: [&str; 3] = ["--tls-ca", "--zenoh-config", "--config"];
 const VARIABLES: [&str; 2] = ["TLS_CA", "ZENOH_CONFIG"];
 
 /// Runs a program on tokio's multi-threaded runtime. If it may use TLS, zenoh's links are confined to one thread, unless the
-/// environment sets [`ZENOH_RUNTIME`].
+/// environment sets `ZENOH_RUNTIME`.
 ///
 /// # Errors
 /// If the runtime cannot be started, or the program fails.

@@ -51,7 +51,7 @@ pub enum RunState {
     Stopped,
     /// Failed; can be resumed.
     Failed {
-        /// Last lines of the run's log.
+        /// Exit status and end of the log.
         reason: String,
     },
     /// Ended with the service that had started it; can be resumed.
