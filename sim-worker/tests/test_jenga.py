@@ -136,7 +136,7 @@ def test_ramming_the_tower_is_no_poke(poke: JengaScene) -> None:
         transition = poke.step(np.clip((seam - state[:3]) / ACTION_METRES, -1, 1).astype(np.float32))
         state = transition.state
         assert not transition.success
-    assert np.linalg.norm(state[10:13] - poke._placed[poke._target]) > 0.005
+    assert np.linalg.norm(state[10:13] - poke._initial[poke._target]) > 0.005
 
 
 def test_unknown_task_is_refused() -> None:
