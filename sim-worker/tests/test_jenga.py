@@ -128,8 +128,8 @@ def test_hand_reaches_the_corners_of_its_workspace_and_no_further(poke: JengaSce
     assert np.abs(state[:3] - corner).max() < 2e-3
 
 
-def test_ramming_the_tower_is_no_poke(poke: JengaScene) -> None:
-    """The fist between two blocks moves both."""
+def test_moving_other_blocks_is_no_poke(poke: JengaScene) -> None:
+    """The closed hand between two blocks moves both."""
     state = poke.reset(1)
     seam = poke.goal_position + np.array([0, 0.045, 0])
     for _ in range(40):
