@@ -1,5 +1,5 @@
-//! The service's side of `make bench-plan`: a planner in a process of its own, and clients that ask it for plans one after the
-//! other. Each measurement is a line of JSON; those of a turn at as many clients follow each other at once, to be compared.
+//! Service benchmark of `make bench-plan`: a planner in a process of its own, and clients with one plan request in flight each. A
+//! measurement is a line of JSON; those of one turn and number of clients are adjacent, for comparison.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
@@ -26,29 +26,29 @@ const MODEL: &str = "cpn";
 const NAME: &str = "bench";
 const CLIENTS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Of a robot that moves ten times a second.
+/// Deadline of a plan, that of a robot with ten actions per second.
 const DEADLINE: Duration = Duration::from_millis(100);
-/// Updates of a plan under overload: enough that asking costs little beside planning.
+/// Updates of a plan under overload, so many that the transport costs little compared with planning.
 const HEAVY_UPDATES: u32 = 20;
 const OVERLOAD: f64 = 4.0;
 
 #[derive(Parser)]
 struct Args {
-    /// Where the lines go.
+    /// Output file of the measurements.
     #[arg(long)]
     out: PathBuf,
-    /// How long each measurement takes.
+    /// Duration of each measurement.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
-    /// How often each is taken.
+    /// Number of turns.
     #[arg(long, default_value_t = 5)]
     turns: u32,
-    /// What `cargo bench` says.
+    /// Flag that `cargo bench` passes.
     #[arg(long, hide = true)]
     bench: bool,
 }
 
-/// Ends the planner when it is dropped.
+/// Process of the planner, killed when dropped.
 struct Process(Child);
 
 impl Drop for Process {
@@ -58,15 +58,15 @@ impl Drop for Process {
     }
 }
 
-/// A planner in a process of its own.
+/// Planner in a process of its own.
 struct Server {
     _process: Process,
-    /// Where zenoh and gRPC are.
+    /// Addresses of zenoh and gRPC.
     endpoints: [String; 2],
     shared_memory: bool,
 }
 
-/// One way to reach a planner.
+/// Client of one transport.
 #[derive(Clone)]
 enum Client {
     InProcess(PlannerCore),
@@ -75,7 +75,7 @@ enum Client {
 }
 
 impl Client {
-    /// As robots join that only ask: by a session each, which knows none but the planner.
+    /// Opens a session as a robot does: in client mode, connected to the planner only.
     async fn zenoh(Server { endpoints: [endpoint, _], shared_memory, .. }: &Server) -> Self {
         let mut config = zenoh::Config::default();
         for (key, value) in [
@@ -120,7 +120,7 @@ async fn main() {
     let planner = planner::start(planner).await.unwrap();
     let here = planner.core().register_goal(RegisterGoalRequest { image: image(0) }).unwrap().goal_id;
     assert!(goal == same_goal && goal == here, "a goal's id is what is in its picture");
-    // Once: a planner keeps what a session shared with it mapped until it ends (eclipse-zenoh/zenoh#2787).
+    // Once, since a planner keeps mapped what closed sessions shared (eclipse-zenoh/zenoh#2787).
     let sharing = join_all((0..CLIENTS[CLIENTS.len() - 1]).map(|_| Client::zenoh(&shared))).await;
     for (_, count) in (0..args.turns).flat_map(|turn| CLIENTS.map(|count| (turn, count))) {
         tell(batches(&models, count, duration));
@@ -136,7 +136,7 @@ async fn main() {
     planner.shutdown().await.unwrap();
 }
 
-/// Plans by the library, so many at a time, without a service: what there is to be had.
+/// Plans by the library in batches, without a service: the upper bound of the throughput.
 fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     let bytes = std::fs::read(models.join(format!("{MODEL}.safetensors"))).unwrap();
     let mut planner = cpn::Planner::new(checkpoint::from_bytes(&bytes).unwrap().agent, Precision::Float32, 1);
@@ -155,7 +155,7 @@ fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     line("library", batch, batch * took.len(), started.elapsed(), &mut took)
 }
 
-/// Clients that ask as soon as they have an answer.
+/// Closed-loop clients, which send a request as soon as the last is answered.
 async fn closed_loop(transport: &str, clients: Vec<Client>, goal: &str, duration: Duration) -> Value {
     let count = clients.len();
     let warm = Instant::now() + Duration::from_millis(300);
@@ -184,7 +184,7 @@ async fn closed_loop(transport: &str, clients: Vec<Client>, goal: &str, duration
     line(transport, count, took.len(), duration, &mut took)
 }
 
-/// Requests of heavy plans, with a deadline, four times as many as can be answered.
+/// Overload: requests of slow plans with a deadline, at four times the rate that can be answered.
 async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
     let search = Search {
         solver: wire::planner::Solver::Gradient,
@@ -227,7 +227,7 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
     })
 }
 
-/// Starts a planner, and registers a goal with it; answers its id.
+/// Starts a planner and registers a goal; returns the goal's id.
 async fn start(models: &Path, shared_memory: bool) -> (Server, String) {
     let free = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let (zenoh, grpc) = (format!("tcp/{}", free()), free());
@@ -251,14 +251,14 @@ fn request(goal: &str, frame: u8) -> PlanRequest {
     PlanRequest::new(MODEL, Goal::Id(goal.into()), image(frame).into())
 }
 
-/// A picture that no other number gives.
+/// Image that is distinct for each number.
 fn image(number: u8) -> Image {
     let side = cpn::images::SIZE as u32;
     let data = (0..cpn::images::BYTES).map(|at| (at as u8).wrapping_mul(31) ^ number).collect();
     Image::new(side, side, data).unwrap()
 }
 
-/// A measurement of latencies and, among them, the service's own time, in seconds.
+/// Measurement of latencies, and of the service's own part of them, in seconds.
 fn line(transport: &str, clients: usize, plans: usize, duration: Duration, took: &mut [(f64, f64)]) -> Value {
     let column = |of: fn(&(f64, f64)) -> f64| {
         let mut values: Vec<_> = took.iter().map(of).collect();
@@ -274,7 +274,7 @@ fn line(transport: &str, clients: usize, plans: usize, duration: Duration, took:
     })
 }
 
-/// Of sorted values; NaN of none.
+/// Quantile of sorted values; NaN if there are none.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     sorted.get((share * sorted.len() as f64) as usize).copied().unwrap_or(f64::NAN)
 }
