@@ -34,6 +34,7 @@ impl Channels {
     /// Registers a schema or channel record; returns the message of a message record.
     pub(crate) fn read(&mut self, opcode: u8, record: &[u8]) -> Result<Option<Message>, Error> {
         let mut fields = Fields(record);
+
         match opcode {
             op::SCHEMA => {
                 let (id, name, encoding) = (fields.u16()?, fields.text()?, fields.text()?);

@@ -113,13 +113,15 @@ async fn main() {
     };
     let duration = Duration::from_secs_f64(args.seconds);
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
+
     let (tcp, goal) = start(&models, false).await;
     let (shared, same_goal) = start(&models, true).await;
     let grpc_listen = ([127, 0, 0, 1], 0).into();
     let planner = planner::Config { models_dir: models.clone(), grpc_listen, ..Default::default() };
     let planner = planner::start(planner).await.unwrap();
     let here = planner.core().register_goal(RegisterGoalRequest { image: image(0) }).unwrap().goal_id;
-    assert!(goal == same_goal && goal == here, "a goal's id is what is in its picture");
+    assert!(goal == same_goal && goal == here, "a goal's id is the digest of its image");
+
     // Once, since a planner keeps mapped what closed sessions shared (eclipse-zenoh/zenoh#2787).
     let sharing = join_all((0..CLIENTS[CLIENTS.len() - 1]).map(|_| Client::zenoh(&shared))).await;
     for (_, count) in (0..args.turns).flat_map(|turn| CLIENTS.map(|count| (turn, count))) {
@@ -132,6 +134,7 @@ async fn main() {
         let clients = vec![Client::InProcess(planner.core()); count];
         tell(closed_loop("in-process service", clients, &goal, duration).await);
     }
+
     tell(overload(Client::zenoh(&tcp).await, &goal, duration * args.turns).await);
     planner.shutdown().await.unwrap();
 }
@@ -179,6 +182,7 @@ async fn closed_loop(transport: &str, clients: Vec<Client>, goal: &str, duration
             took
         })
     };
+
     let runs = join_all(clients.into_iter().enumerate().map(run)).await;
     let mut took: Vec<_> = runs.into_iter().flat_map(Result::unwrap).collect();
     line(transport, count, took.len(), duration, &mut took)
@@ -193,12 +197,14 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
         anytime: false,
     };
     let heavy = |frame| PlanRequest { search: Some(search), ..request(goal, frame) };
+
     let (started, mut alone) = (Instant::now(), 0);
     while started.elapsed() < Duration::from_secs(1) {
         join_all((0..16).map(|frame| client.plan(heavy(frame)))).await.into_iter().for_each(|plan| drop(plan.unwrap()));
         alone += 16;
     }
     let capacity = f64::from(alone) / started.elapsed().as_secs_f64();
+
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / (OVERLOAD * capacity)));
     let (started, mut asked) = (Instant::now(), Vec::new());
     while started.elapsed() < duration {
@@ -210,6 +216,7 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
             (answer, asked.elapsed().as_secs_f64())
         }));
     }
+
     let answers: Vec<_> = join_all(asked).await.into_iter().map(Result::unwrap).collect();
     let seconds = |keep: &dyn Fn(&Result<PlanResponse, Error>) -> bool| {
         let mut kept: Vec<_> = answers.iter().filter(|(answer, _)| keep(answer)).map(|(_, seconds)| *seconds).collect();

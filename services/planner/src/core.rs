@@ -106,6 +106,7 @@ impl PlannerCore {
         if !self.thread.models().contains_key(&model) {
             return Err(unknown_model(&model, self.thread.models().keys()));
         }
+
         let (goal_field, (goal_id, goal)) = match goal {
             Goal::Id(id) => {
                 let goal = self.goals.get(&id)?;
@@ -117,6 +118,7 @@ impl PlannerCore {
             }
             Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
+
         Ok(PlanTask {
             model,
             model_digest,
@@ -306,6 +308,7 @@ mod tests {
         let models_dir = tempfile::TempDir::new().unwrap();
         let config = Config { models_dir: models_dir.path().into(), ..Config::default() };
         let core = PlannerCore::start(&config).await.unwrap();
+
         let (sender, entered) = mpsc::channel();
         let (release, released) = mpsc::channel::<()>();
         let released = Arc::new(Mutex::new(released));
@@ -323,6 +326,7 @@ mod tests {
             let entered = Arc::clone(&entered);
             tokio::task::spawn_blocking(move || entered.lock().unwrap().recv_timeout(PATIENCE).unwrap())
         };
+
         for round in 0..20 {
             core.plan_then(request(), unread());
             has_entered().await.unwrap();
@@ -338,6 +342,7 @@ mod tests {
             );
             swapped.await.unwrap_or_else(|_| panic!("swap {round} waits for an answer to a client")).unwrap();
         }
+
         // The blocked replies return one by one; plans continue as before.
         for _ in 0..20 {
             release.send(()).unwrap();

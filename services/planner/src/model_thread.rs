@@ -270,6 +270,7 @@ impl Leadership {
     fn lead(&self) {
         let load = &*self.load;
         let lock = || self.leader.lock().unwrap_or_else(PoisonError::into_inner);
+
         let mut owned = lock();
         while let Some(Leader { owner, jobs }) = owned.as_mut() {
             match owner.step(jobs) {
@@ -309,6 +310,7 @@ impl Leadership {
                     this.take_over(reply);
                 }
                 before = reply;
+
                 let nothing_to_watch = || this.load.tasks() == 0 && this.load.replying().is_none();
                 if nothing_to_watch() {
                     this.is_watched.store(false, Ordering::SeqCst);

@@ -153,12 +153,14 @@ impl Requests {
         let (core, tasks) = (self.core.clone(), self.tasks.clone());
         let (places, capacity, outbox) = (Arc::clone(&self.plans), self.capacity, core.outbox());
         let own = Arc::new(key.clone());
+
         let callback = move |mut query: Query| {
             let own = Arc::clone(&own);
             let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
                 // Sent here, which may block: backpressure on clients with too many unread answers.
                 return reply::<PlanResponse>(&query, &own, Err(queue_full(capacity)));
             };
+
             let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
             // Frees the payload, which an answer that waits to be sent no longer needs.
             query.payload_mut().into_iter().for_each(|payload| *payload = ZBytes::new());
@@ -193,6 +195,7 @@ impl Requests {
         let (core, places, capacity) = (core.clone(), Arc::clone(places), *capacity);
         let (tasks, runtime, outbox) = (tasks.clone(), runtime.clone(), core.outbox());
         let own = Arc::new(key.clone());
+
         let callback = move |query: Query| {
             let (outbox, in_flight) = (outbox.clone(), tasks.token());
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
@@ -213,6 +216,7 @@ impl Requests {
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
+
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }
 }
