@@ -16,11 +16,11 @@ const USABLE: f64 = 0.9;
 /// Sliced searches in progress, in round-robin order.
 #[derive(Default)]
 pub(crate) struct Searches {
-    waiting: VecDeque<Searching>,
+    waiting: VecDeque<SlicedSearch>,
 }
 
 /// Sliced search of a batch: several tasks by gradient, or a single one.
-pub(crate) struct Searching {
+pub(crate) struct SlicedSearch {
     tasks: Vec<Accepted>,
     /// Latents (x, x_g) of each task.
     latents: Vec<(Vec<f32>, Vec<f32>)>,
@@ -42,7 +42,7 @@ impl Searches {
 
     /// Number of tasks in all searches.
     pub(crate) fn tasks(&self) -> usize {
-        self.waiting.iter().map(|searching| searching.tasks.len()).sum()
+        self.waiting.iter().map(|search| search.tasks.len()).sum()
     }
 
     /// Begins the search of a batch of embedded tasks.
@@ -55,13 +55,21 @@ impl Searches {
     ) {
         let spans = tasks.iter().map(|accepted| debug_span!(parent: &accepted.task.span, "search")).collect();
         let (model, ongoing) = (model.clone(), model.model().begin(tasks[0].task.search));
-        self.waiting.push_back(Searching { tasks, latents, model, ongoing, encoded, searched: Duration::ZERO, spans });
+        self.waiting.push_back(SlicedSearch {
+            tasks,
+            latents,
+            model,
+            ongoing,
+            encoded,
+            searched: Duration::ZERO,
+            spans,
+        });
     }
 
     /// Advances the next search, by [`SLICE`] or, if other tasks wait, by `share`. Returns the tasks that are done, with their
     /// answers.
     pub(crate) fn advance(&mut self, load: &Load, share: Duration) -> Vec<(Accepted, Answer)> {
-        let searching_for = self.tasks();
+        let own_tasks = self.tasks();
         let Some(mut search) = self.waiting.pop_front() else { return Vec::new() };
         let mut answers = search.remove_expired(load);
         if search.tasks.is_empty() {
@@ -69,12 +77,13 @@ impl Searches {
         }
 
         let alone = search.tasks.len() == 1;
-        let (others, anyone) = (|| load.tasks() > searching_for, || load.tasks() > 1);
+        let (others, anyone) = (|| load.tasks() > own_tasks, || load.tasks() > 1);
         let task = &search.tasks[0];
         let end = task.task.is_anytime().then(|| {
             let deadline = task.task.deadline.unwrap_or_default();
             task.enqueued + deadline.mul_f64(USABLE)
         });
+
         let (started, before) = (Instant::now(), search.ongoing.rollouts());
         let mut last = started;
         let mut longest = Duration::ZERO;
@@ -123,7 +132,7 @@ impl Searches {
     }
 }
 
-impl Searching {
+impl SlicedSearch {
     /// Removes tasks that are past their deadline, cancelled or aborted, with their errors.
     fn remove_expired(&mut self, load: &Load) -> Vec<(Accepted, Answer)> {
         let mut removed = Vec::new();
