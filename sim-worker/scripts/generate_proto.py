@@ -14,7 +14,7 @@ OUTPUT = PACKAGE / "src"
 def main() -> int:
     """Runs protoc; returns its exit code."""
     sources = sorted(str(path) for path in PROTO.glob("cpn/v1/*.proto"))
-    # The only files with gRPC services; stubs of the others would be empty.
+    # Only these have gRPC services: a stub file for each of the other protos would be empty.
     services = [path for path in sources if path.endswith(("planner.proto", "training.proto"))]
     includes = [f"-I{PROTO}", f"-I{files('grpc_tools') / '_proto'}"]
     messages = protoc.main(["", *includes, f"--python_out={OUTPUT}", f"--pyi_out={OUTPUT}", *sources])
