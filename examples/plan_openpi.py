@@ -1,4 +1,4 @@
-"""Asks a planner for a plan towards a picture with openpi's own client.
+"""Plan request with openpi's own client, towards a goal image.
 
 tests/openpi/.venv/bin/python examples/plan_openpi.py examples/goal.png examples/frame.png
 """
@@ -12,7 +12,7 @@ from PIL import Image
 
 
 def read(path: str) -> np.ndarray:
-    """The picture in a file, as the planner wants it."""
+    """Image file as an array, [84, 84, 3], uint8, RGB."""
     return resize_with_pad(np.asarray(Image.open(path).convert("RGB")), 84, 84)
 
 

@@ -1,4 +1,4 @@
-"""Asks a planner over zenoh for a plan towards a picture.
+"""Plan request over zenoh, towards a goal image.
 
 examples/.venv/bin/python examples/plan_zenoh.py examples/goal.png examples/frame.png
 """
@@ -12,7 +12,7 @@ from cpn.v1 import planner_pb2, types_pb2
 
 
 def read(path: str) -> types_pb2.Image:
-    """The picture in a file, as the planner wants it."""
+    """Image file as a message, 84 x 84 pixels, RGB."""
     image = Image.open(path).convert("RGB").resize((84, 84))
     return types_pb2.Image(height=84, width=84, format=types_pb2.PIXEL_FORMAT_RGB8, data=image.tobytes())
 

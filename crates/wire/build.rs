@@ -6,6 +6,7 @@ use std::{env, error::Error, fs, path::Path};
 fn main() -> Result<(), Box<dyn Error>> {
     let root = Path::new(&env::var("CARGO_MANIFEST_DIR")?).join("../../proto");
     println!("cargo::rerun-if-changed={}", root.display());
+
     let mut files = Vec::new();
     for entry in fs::read_dir(root.join("cpn/v1"))? {
         files.push(entry?.path());

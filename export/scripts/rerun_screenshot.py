@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["rerun-sdk==0.41.0"]
 # ///
-"""Photographs Rerun's own viewer with a recording opened as it is, on a screen that nobody sees.
+"""Screenshot of Rerun's viewer with a recording, on a virtual display.
 
 Needs the Debian packages xauth, xvfb and mesa-vulkan-drivers.
 
@@ -17,13 +17,13 @@ TIMEOUT_SECONDS = 120
 
 
 def main() -> None:
-    """Saves what the viewer shows of the recording."""
+    """Saves the screenshot."""
     try:
         recording, picture = (Path(argument) for argument in sys.argv[1:])
     except ValueError:
         sys.exit("usage: rerun_screenshot.py RECORDING.mcap PICTURE.png")
-    # The pointer rests at the middle of the screen, where it must not point at the window: that is in the upper left,
-    # and twice as large in pixels as it is told to be.
+    # The screen is large enough that the pointer, at its middle, is outside the window, which is in the upper left and
+    # twice as large in pixels as requested.
     screen = ["xvfb-run", "--auto-servernum", "--server-args", "-screen 0 5000x3200x24"]
     viewer = [str(Path(sys.executable).with_name("rerun")), "--bind", "127.0.0.1", "--port", "auto"]
     options = ["--window-size", "1200x760", "--screenshot-to", str(picture), str(recording)]

@@ -13,7 +13,7 @@ SIZE, STATE_SIZE, ACTION_SIZE = 84, 39, 4
 
 @dataclass
 class Sample:
-    """A recording with random contents, to be changed before it is written."""
+    """Recording with random contents, which can be changed before it is written."""
 
     task: str
     seed: int
@@ -24,10 +24,10 @@ class Sample:
     steps: int | None = None
     digest: str | None = None
     step_hz: float | None = None
-    """What the times of steps tell, if not `control_hz`."""
+    """Control rate of the steps' times, if not `control_hz`."""
     action_scale: float = 1.0
     last_action: bool = False
-    """Whether the goal frame has an action, which it must not have."""
+    """Whether the goal frame has an action, which is a fault."""
     goal_position: tuple[float, ...] = (0.5, 0.25, 0.125)
     frames: NDArray[np.uint8] = field(init=False)
     actions: NDArray[np.float32] = field(init=False)
@@ -50,7 +50,7 @@ class Sample:
         return f"{self.task}-{self.seed}"
 
     def write(self, dataset: Path, place: str | None = None) -> Path:
-        """Writes the recording to where it belongs, or to another place."""
+        """Writes the recording to its own path, or to another one."""
         path = dataset / (place or f"{self.task}/{self.episode_id}.mcap")
         path.parent.mkdir(parents=True, exist_ok=True)
         actions = [*self.actions, np.ones(ACTION_SIZE, np.float32) if self.last_action else np.empty(0, np.float32)]

@@ -25,12 +25,12 @@ def export(dataset: Path, out: Path, *tasks: str, episodes: int | None = None) -
 
 
 def pixels(image: torch.Tensor) -> np.ndarray:
-    """What LeRobot gives as [3, height, width] in [0, 1], as it was recorded."""
+    """Converts LeRobot's image, [3, height, width] in [0, 1], to a recorded frame."""
     return np.asarray((image * 255).round().to(torch.uint8).permute(1, 2, 0))
 
 
-def test_a_dataset_holds_what_the_recordings_hold(tmp_path: Path) -> None:
-    # Seed 10 after 9: numbers, not names, are in order.
+def test_a_dataset_has_the_contents_of_its_recordings(tmp_path: Path) -> None:
+    # Seed 10 comes after 9: the order is by number, not by name.
     samples = [Sample("door-lock", 9, length=6), Sample("door-lock", 10, length=3), Sample("reach", 2, length=4)]
     for sample in reversed(samples):
         sample.write(tmp_path / "data")
@@ -73,7 +73,7 @@ def test_goals_lie_beside_the_rows(tmp_path: Path) -> None:
     assert not (out / "images").exists()
 
 
-def test_tasks_and_episodes_narrow_the_choice(tmp_path: Path) -> None:
+def test_tasks_and_episodes_select_recordings(tmp_path: Path) -> None:
     for task in ("door-lock", "reach"):
         for seed in range(3):
             Sample(task, seed).write(tmp_path / "data")
@@ -82,7 +82,7 @@ def test_tasks_and_episodes_narrow_the_choice(tmp_path: Path) -> None:
     assert list(exported.meta.tasks.index) == ["reach"]
 
 
-def test_what_exists_is_left_alone(tmp_path: Path) -> None:
+def test_an_existing_output_is_refused_and_unchanged(tmp_path: Path) -> None:
     Sample("reach", 1).write(tmp_path / "data")
     out = tmp_path / "out"
     out.mkdir()
@@ -103,7 +103,7 @@ def test_a_failed_run_leaves_nothing(tmp_path: Path) -> None:
     assert names(tmp_path) == {"data"}
 
 
-def test_a_killed_run_is_cleared_away(tmp_path: Path) -> None:
+def test_folders_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     Sample("reach", 1).write(tmp_path / "data")
     out = tmp_path / "out"
     program = "import os, sys; from pathlib import Path; from cpn_export.workshop import workshop\n"
@@ -117,7 +117,7 @@ def test_a_killed_run_is_cleared_away(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["out.partial", ".out.partial", ".out.mine.partial"])
-def test_nobodys_folders_are_deleted(tmp_path: Path, name: str) -> None:
+def test_folders_of_others_are_not_deleted(tmp_path: Path, name: str) -> None:
     Sample("reach", 1).write(tmp_path / "data")
     (tmp_path / name).mkdir()
     (tmp_path / name / "mine").touch()
@@ -126,7 +126,7 @@ def test_nobodys_folders_are_deleted(tmp_path: Path, name: str) -> None:
     assert names(tmp_path) == {"data", "out", name}
 
 
-def test_a_link_to_nowhere_is_left_alone(tmp_path: Path) -> None:
+def test_a_dangling_link_is_refused_and_unchanged(tmp_path: Path) -> None:
     Sample("reach", 1).write(tmp_path / "data")
     out = tmp_path / "out"
     out.symlink_to("nowhere")
@@ -136,8 +136,8 @@ def test_a_link_to_nowhere_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("blocks", [4, 64])
-def test_a_full_disk_is_one_line(tmp_path: Path, blocks: int) -> None:
-    """As if after so many KiB of a file nothing fitted any more: not a picture, or not the whole of a table."""
+def test_a_full_disk_gives_a_one_line_error(tmp_path: Path, blocks: int) -> None:
+    """Simulates a full disk by a limit on file sizes, which an image or a table exceeds."""
     Sample("reach", 1, length=40).write(tmp_path / "data")
     command = [COMMAND, "--dataset", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
     limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$@"', "bash", *command]
@@ -151,14 +151,14 @@ def test_a_full_disk_is_one_line(tmp_path: Path, blocks: int) -> None:
     assert names(tmp_path) == {"data"}
 
 
-def test_a_place_that_cannot_be_is_named(tmp_path: Path) -> None:
+def test_an_impossible_output_path_is_named(tmp_path: Path) -> None:
     Sample("reach", 1).write(tmp_path / "data")
     (tmp_path / "file").touch()
     with pytest.raises(ExportError, match=r"out: expected room for a dataset at .*/file/out, got (Not a|File exists)"):
         export(tmp_path / "data", tmp_path / "file" / "out")
 
 
-def test_the_command_exports_and_says_what_is_wrong(
+def test_the_command_exports_and_reports_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Sample("reach", 1).write(tmp_path / "data")

@@ -16,7 +16,7 @@ def read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["nothing", "half", "all but the end"])
-def test_a_torn_file_is_named(tmp_path: Path, part: str) -> None:
+def test_a_truncated_file_is_named(tmp_path: Path, part: str) -> None:
     path = Sample("reach", 1).write(tmp_path)
     whole = path.read_bytes()
     path.write_bytes(whole[: {"nothing": 0, "half": len(whole) // 2, "all but the end": -1}[part]])
@@ -27,7 +27,7 @@ def test_a_torn_file_is_named(tmp_path: Path, part: str) -> None:
 def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
     path = Sample("reach", 1).write(tmp_path)
     whole = path.read_bytes()
-    # Up to the end of the one chunk; behind it are only indices, which are not used.
+    # Up to the end of the only chunk; after it there are only indices, which are not used.
     for position in range(0, whole.rindex(Sample("reach", 1).frames[-1].tobytes()[-64:]), 997):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :])
         with pytest.raises(ExportError, match=r"reach-1\.mcap"):
@@ -46,12 +46,12 @@ def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
         (Sample("reach", 1, step_hz=40), r"times at /step: expected \[0, 12500000, .*, got \[0, 25000000, "),
     ],
 )
-def test_steps_that_are_not_what_the_header_says_are_refused(tmp_path: Path, sample: Sample, message: str) -> None:
+def test_steps_that_do_not_match_the_header_are_refused(tmp_path: Path, sample: Sample, message: str) -> None:
     with pytest.raises(ExportError, match=rf"reach-1\.mcap: {message}"):
         read(sample.write(tmp_path))
 
 
-def test_the_digest_is_the_one_agreed_upon(tmp_path: Path) -> None:
+def test_the_digest_matches_the_golden_one(tmp_path: Path) -> None:
     sample = Sample("golden", 0, length=2, state_size=2, digest=json.loads(GOLDEN.read_text())["digest"])
     numbers = np.arange(3, dtype=np.float32)
     pixels = 7 * np.arange(SIZE * SIZE * 3) + 13 * np.arange(3)[:, np.newaxis]

@@ -7,7 +7,7 @@ from cpn_export.selection import select_recordings
 from tests.support import Sample
 
 
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+def test_missing_tasks_and_recordings_are_named(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"dataset: expected a folder, got .*nowhere"):
         select_recordings(tmp_path / "nowhere")
     with pytest.raises(ExportError, match="dataset: expected recordings at"):
@@ -27,21 +27,21 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         (Sample("reach", 2, render_spec="{}"), r"render_spec: expected .*corner4.* as in .*, got '{}' in .*reach-2"),
     ],
 )
-def test_recordings_that_differ_do_not_meet_in_a_dataset(tmp_path: Path, odd: Sample, message: str) -> None:
+def test_recordings_with_different_settings_are_refused(tmp_path: Path, odd: Sample, message: str) -> None:
     Sample("reach", 1).write(tmp_path)
     odd.write(tmp_path)
     with pytest.raises(ExportError, match=message):
         select_recordings(tmp_path)
 
 
-def test_a_rate_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
+def test_a_fractional_control_rate_is_refused(tmp_path: Path) -> None:
     Sample("reach", 1, control_hz=12.5).write(tmp_path)
     with pytest.raises(ExportError, match=r"control_hz: expected a whole number, as LeRobot's fps, got 12\.5"):
         select_recordings(tmp_path)
 
 
 @pytest.mark.parametrize("place", ["reach/copy.mcap", "reach/reach-1 (1).mcap", "door-lock/reach-1.mcap"])
-def test_a_recording_is_taken_where_it_belongs_only(tmp_path: Path, place: str) -> None:
+def test_a_misplaced_recording_is_refused(tmp_path: Path, place: str) -> None:
     kept = Sample("reach", 1).write(tmp_path)
     copied = Sample("reach", 1).write(tmp_path, place)
     with pytest.raises(ExportError) as refusal:
@@ -51,7 +51,7 @@ def test_a_recording_is_taken_where_it_belongs_only(tmp_path: Path, place: str) 
     assert [header.path for header in select_recordings(tmp_path)] == [kept]
 
 
-def test_an_episode_is_taken_once(tmp_path: Path) -> None:
+def test_a_duplicate_episode_is_refused(tmp_path: Path) -> None:
     first, second = Sample("reach", 1, digest="00ff"), Sample("reach", 2, digest="00ff")
     paths = [sample.write(tmp_path) for sample in (first, second)]
     with pytest.raises(
@@ -60,7 +60,7 @@ def test_an_episode_is_taken_once(tmp_path: Path) -> None:
         select_recordings(tmp_path)
 
 
-def test_names_that_begin_with_a_dot_are_nobodys(tmp_path: Path) -> None:
+def test_hidden_names_are_ignored(tmp_path: Path) -> None:
     kept = Sample("reach", 1).write(tmp_path)
     for place in ("reach/._reach-1.mcap", ".Trash-1000/reach-1.mcap", ".reach/reach-2.mcap"):
         (tmp_path / place).parent.mkdir(exist_ok=True)
@@ -72,7 +72,7 @@ def test_names_that_begin_with_a_dot_are_nobodys(tmp_path: Path) -> None:
         select_recordings(tmp_path, (".reach",))
 
 
-def test_a_task_without_recordings_is_no_task(tmp_path: Path) -> None:
+def test_a_task_without_recordings_is_unknown(tmp_path: Path) -> None:
     (tmp_path / "reach").mkdir()
     (tmp_path / "reach" / "._reach-1.mcap").touch()
     with pytest.raises(ExportError, match="dataset: expected recordings at"):

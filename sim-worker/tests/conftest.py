@@ -16,7 +16,7 @@ from tests.support import COMMAND, READY_SECONDS, Log, StartWorker, collect, fre
 
 @pytest.fixture(scope="session", autouse=True)
 def _no_options_from_outside() -> Iterator[None]:
-    """Takes away the variables that stand in for options, for the processes under test too."""
+    """Unsets the environment variables of options, also for the processes under test."""
     with pytest.MonkeyPatch.context() as patch:
         for variable in [name for name in os.environ if name.startswith("CPN_") or name == "ZENOH_CONFIG"]:
             patch.delenv(variable)
@@ -25,7 +25,7 @@ def _no_options_from_outside() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def simulator() -> Simulator:
-    """The one simulator with a renderer that this process may hold."""
+    """Simulator of the session: a process can have only one renderer."""
     return Simulator(Renderer())
 
 
@@ -36,7 +36,7 @@ def endpoint() -> str:
 
 @pytest.fixture(scope="session")
 def session(endpoint: str) -> Iterator[zenoh.Session]:
-    """The peer that every process under test connects to."""
+    """Peer that all processes under test connect to."""
     with open_session(ZenohConfig(listen=(endpoint,))) as session:
         yield session
 
@@ -64,7 +64,7 @@ def start_worker(session: zenoh.Session, endpoint: str) -> Iterator[StartWorker]
 
 @pytest.fixture
 def session_log() -> Iterator[Log]:
-    """What the sessions of the test log."""
+    """Log of the test's sessions."""
     handler = Log()
     logger = logging.getLogger("cpn_sim_worker.session")
     level = logger.level
@@ -77,5 +77,5 @@ def session_log() -> Iterator[Log]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warnings that come soon, in this process."""
+    """Short intervals of warnings, in this process."""
     monkeypatch.setattr("cpn_sim_worker.session.REMINDER_SECONDS", 0.3)

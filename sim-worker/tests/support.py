@@ -24,30 +24,30 @@ READY_SECONDS = 60.0
 StartWorker = Callable[..., subprocess.Popen[bytes]]
 
 UNSOLVED = ("door-open", 2)
-"""A task and a seed whose variation the scripted expert fails; the next seed's it solves."""
+"""Task and seed of a variation that the scripted expert fails, unlike that of the next seed."""
 
 
 def collect() -> tuple[Callable[[zenoh.Sample], None], "queue.Queue[zenoh.Sample]"]:
-    """A handler for a subscriber that keeps its samples in a queue."""
+    """Subscriber's handler that queues its samples."""
     samples: queue.Queue[zenoh.Sample] = queue.Queue()
     return samples.put, samples
 
 
 def wait_for_sample(subscriber: "zenoh.Subscriber[queue.Queue[zenoh.Sample]]", kind: zenoh.SampleKind) -> zenoh.Sample:
-    """The next sample, which has to be of `kind`."""
+    """Next sample, which must be of `kind`."""
     sample = subscriber.handler.get(timeout=READY_SECONDS)
     assert sample.kind == kind
     return sample
 
 
 def pixels(image: types_pb2.Image) -> NDArray[np.uint8]:
-    """An image's pixels, [height, width, 3]."""
+    """Pixels of an image, [height, width, 3]."""
     assert image.format == types_pb2.PIXEL_FORMAT_RGB8
     return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
 
 
 def free_endpoint(protocol: str = "tcp", host: str = "127.0.0.1") -> str:
-    """An endpoint that nobody listens on, below the ports that the system hands out.
+    """Free endpoint, below the ephemeral ports of the system.
 
     Of those, one that a client asks again and again might be handed to the client itself.
     """
@@ -78,7 +78,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 class Log(logging.Handler):
-    """What a logger says, seen from every thread."""
+    """Messages of a logger, from all threads."""
 
     def __init__(self) -> None:
         super().__init__()

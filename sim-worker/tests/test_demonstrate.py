@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Trainer:
-    """Receives demonstrations and loses every seventh step the first time."""
+    """Trainer stub that drops every seventh step the first time."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.steps: defaultdict[str, dict[int, Step]] = defaultdict(dict)
@@ -119,7 +119,7 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
 
 
 def test_slow_trainer_gets_everything(trainer: Trainer, endpoint: str) -> None:
-    """One whose commits answer long before it has come to the steps."""
+    """A trainer that answers commits long before it has processed the steps."""
     trainer.seconds_per_step = 0.05
     run = demonstrate(endpoint, "--tasks", "coffee-button", "--episodes", "1")
     assert run.returncode == 0, run.stderr
@@ -131,13 +131,13 @@ def test_episodes_survive_the_loss_of_their_router() -> None:
     command = [COMMAND, "demonstrate", "--mode", "client", "--connect", endpoint]
     command += ["--tasks", "coffee-button", "--episodes", "2"]
     with ExitStack() as stack:
-        # Nobody routes yet.
+        # There is no router yet.
         process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         stack.callback(process.kill)
         with open_session(router(endpoint)):
             trainer = Trainer(stack.enter_context(open_session(client(endpoint))))
             stack.callback(trainer.close)
-            # The router is lost while steps are under way.
+            # The router is lost while steps are in transit.
             trainer.seconds_per_step = 0.5
             wait_for(lambda: len(trainer.received) > 2)
         received = len(trainer.received)
@@ -166,13 +166,13 @@ def test_digest_is_the_same_in_every_language() -> None:
     assert digest(steps) == golden["digest"]
 
 
-def test_digest_does_not_tell_a_reward_of_minus_zero_from_zero() -> None:
+def test_digest_ignores_the_sign_of_a_zero_reward() -> None:
     zero, minus_zero = Step(reward=0.0), Step(reward=-0.0)
     assert zero.SerializeToString() != minus_zero.SerializeToString()
     assert digest([zero]) == digest([minus_zero]) != digest([Step(reward=0.5)])
 
 
-def test_another_rendering_is_not_taken_for_recorded(trainer: Trainer, endpoint: str) -> None:
+def test_episode_recorded_with_another_render_spec_is_refused(trainer: Trainer, endpoint: str) -> None:
     trainer.kept["reach-0"] = demonstration_pb2.RecordedEpisode(episode_id="reach-0", render_spec="another")
     run = demonstrate(endpoint, "--tasks", "reach", "--episodes", "1")
     assert run.returncode == 1
@@ -205,6 +205,6 @@ def test_refusal_ends_the_run_with_its_reason(trainer: Trainer, endpoint: str) -
         ({"tasks": ("juggle",)}, "unknown task 'juggle'"),
     ],
 )
-def test_configuration_at_fault_is_refused(options: dict[str, int], message: str) -> None:
+def test_invalid_configuration_is_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DemonstrateConfig(**options)  # pyright: ignore[reportArgumentType]

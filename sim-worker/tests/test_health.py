@@ -36,7 +36,7 @@ def test_worker_behind_a_router_is_found() -> None:
 
 
 def test_worker_among_peers_is_found(session: zenoh.Session, endpoint: str, start_worker: StartWorker) -> None:
-    """Without a port of its own, by way of what the worker connects to."""
+    """A worker without a listening port is found by the endpoint that it connects to."""
     start_worker("watched")
     healthy = check("--worker", "watched", "--connect", endpoint)
     assert healthy.returncode == 0, healthy.stderr
@@ -58,7 +58,7 @@ def test_worker_that_others_connect_to_is_found(start_worker: StartWorker) -> No
         ({}, "--connect (CPN_CONNECT): expected an endpoint of the network"),
     ],
 )
-def test_options_at_fault_are_unhealthy(environment: dict[str, str], reason: str) -> None:
+def test_invalid_options_are_unhealthy(environment: dict[str, str], reason: str) -> None:
     run = check(**environment)
     assert run.returncode == 1
     assert reason in run.stderr

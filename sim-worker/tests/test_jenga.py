@@ -128,15 +128,15 @@ def test_hand_reaches_the_corners_of_its_workspace_and_no_further(poke: JengaSce
     assert np.abs(state[:3] - corner).max() < 2e-3
 
 
-def test_ramming_the_tower_is_no_poke(poke: JengaScene) -> None:
-    """The fist between two blocks moves both."""
+def test_moving_other_blocks_is_no_poke(poke: JengaScene) -> None:
+    """The closed hand between two blocks moves both."""
     state = poke.reset(1)
     seam = poke.goal_position + np.array([0, 0.045, 0])
     for _ in range(40):
         transition = poke.step(np.clip((seam - state[:3]) / ACTION_METRES, -1, 1).astype(np.float32))
         state = transition.state
         assert not transition.success
-    assert np.linalg.norm(state[10:13] - poke._placed[poke._target]) > 0.005
+    assert np.linalg.norm(state[10:13] - poke._initial[poke._target]) > 0.005
 
 
 def test_unknown_task_is_refused() -> None:

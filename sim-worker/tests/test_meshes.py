@@ -38,7 +38,7 @@ MESH_ARRAYS = ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal")
 
 @pytest.fixture(autouse=True)
 def cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    # Not pytest's own folder, which is closed to the other user of `unprivileged`.
+    # Not pytest's own folder, which the other user of `unprivileged` cannot enter.
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # noqa: S103
         monkeypatch.setenv("XDG_CACHE_HOME", folder)
@@ -47,7 +47,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def unprivileged() -> Iterator[None]:
-    """A user that permissions count for, even where tests run as root."""
+    """Unprivileged user, for whom permissions are checked even if the tests run as root."""
     if privileged := os.geteuid() == 0:
         os.seteuid(65534)
     yield
@@ -61,7 +61,7 @@ def decimate() -> dict[str, NDArray[Any]]:
 
 
 def assert_decimated_anew(caplog: pytest.LogCaptureFixture, *warnings: str) -> None:
-    """The meshes are right, and the log names each file and fault, once."""
+    """Asserts that the meshes are correct, and that the log names each file and fault once."""
     caplog.clear()
     for _ in range(2):
         meshes = decimate()
@@ -85,7 +85,7 @@ def test_large_meshes_get_fewer_faces_on_the_same_surface() -> None:
     assert np.einsum("fcx,fcx->fc", normals, corners).min() > 0.97, "a sphere's normals point where its corners are"
 
 
-def test_the_original_stays_as_it_was() -> None:
+def test_the_original_model_is_unchanged() -> None:
     model, untouched = (mujoco.MjModel.from_xml_string(SPHERES) for _ in range(2))
     decimated(model, Decimation(100))
     for name in ("mesh_vert", "mesh_face", "mesh_facenum", "mesh_facenormal", "geom_pos", "body_inertia"):
@@ -125,7 +125,7 @@ def flip(path: Path) -> None:
 
 
 def rewrite(change: Callable[[dict[str, NDArray[Any]]], object]) -> Callable[[Path], None]:
-    """Another file that is whole, with something in it that is not."""
+    """Intact file with invalid contents."""
 
     def spoil(path: Path) -> None:
         with np.load(path) as archive:
@@ -200,8 +200,8 @@ def test_a_cache_can_be_shared(cache: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_full_file_system_keeps_nothing(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """No byte more fits, and no torn file stays."""
+def test_a_full_file_system_is_survived(cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """On a full file system no partial file is left."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
@@ -226,7 +226,7 @@ def test_something_else_in_the_place_of_a_file(cache: Path, caplog: pytest.LogCa
     (path,) = cache.iterdir()
     path.unlink()
     os.mkfifo(path)
-    # Nobody writes to the pipe: reading would never end.
+    # The pipe has no writer, so that reading would never end.
     assert_decimated_anew(caplog, f"{path} cannot be read: ValueError: expected a file")
     assert path.is_file()
 
@@ -236,9 +236,11 @@ def test_something_else_in_the_place_of_a_file(cache: Path, caplog: pytest.LogCa
     assert list(cache.iterdir()) == [path]
 
 
-def test_nobody_needs_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_home_folder_is_survived(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.chdir(tmp_path)
-    # As in a container whose user its list of users does not have.
+    # As in a container whose user is not in its list of users.
     monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")

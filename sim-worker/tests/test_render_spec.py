@@ -9,14 +9,14 @@ from cpn_sim_worker.render import TESSELLATION
 from cpn_sim_worker.simulator import Simulator
 
 MAX_BYTES = 480
-"""An error that shows a spec cuts its texts at 500."""
+"""Length at which errors truncate a quoted spec."""
 DECIMATING = {"mujoco", "fast-simplification", "numpy", "scipy"}
 
 
 @pytest.mark.parametrize(
     ("task", "library", "revision"), [("reach", "metaworld", ""), ("jenga-poke", "dm_control", JengaScene.revision)]
 )
-def test_spec_holds_what_decides_the_pixels(simulator: Simulator, task: str, library: str, revision: str) -> None:
+def test_spec_has_all_settings_of_the_pixels(simulator: Simulator, task: str, library: str, revision: str) -> None:
     simulator.load(task)
     text = str(simulator.render_spec)
     assert len(text.encode()) < MAX_BYTES
@@ -31,7 +31,7 @@ def test_undecimated_is_mujocos_own_tessellation_too(simulator: Simulator, monke
     simulator.reset("drawer-open", 0)
     light = simulator.frame()
     monkeypatch.setattr(simulator._renderer, "_decimation", None)
-    # Another simulator: of the same scene the renderer keeps the copy that it draws.
+    # Another simulator, since the renderer keeps its copy of a scene.
     whole = Simulator(simulator._renderer)
     whole.reset("drawer-open", 0)
     spec, quality = whole.render_spec, whole.scene.model.vis.quality

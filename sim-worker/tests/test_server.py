@@ -39,7 +39,7 @@ REST = (0.0, 0.0, 0.0, 0.0)
 
 
 class Worker:
-    """A client of one worker."""
+    """Client of one worker."""
 
     def __init__(self, session: zenoh.Session, name: str) -> None:
         self.session = session
@@ -54,7 +54,7 @@ class Worker:
         return ask(self.session, keys.sim_step(self.name), request, sim_pb2.StepResponse, READY_SECONDS)
 
     def error(self, key: str, payload: bytes) -> types_pb2.Error:
-        """The error reply to raw bytes."""
+        """Error reply to raw bytes."""
         (reply,) = self.session.get(key, payload=payload, timeout=READY_SECONDS)
         assert reply.err is not None
         assert str(reply.err.encoding) == encoding(types_pb2.Error)
@@ -243,7 +243,7 @@ def test_sigterm_ends_a_worker_and_its_token(session: zenoh.Session, start_worke
 
 
 def test_fault_in_a_request_is_answered_and_ends_the_episode(session: zenoh.Session, simulator: Simulator) -> None:
-    # An episode whose simulator never loaded a task.
+    # An episode without a loaded task.
     episodes = EpisodeRunner(Simulator(simulator._renderer), max_steps=1)
     episodes._episode = _Episode("x")
     server = SimServer(session, "faulty", episodes)
@@ -269,7 +269,7 @@ def test_worker_is_found_again_after_its_router(simulator: Simulator) -> None:
     command = [COMMAND, "serve", "--worker", "routed", "--mode", "client", "--connect", endpoint]
     with ExitStack() as stack, subprocess.Popen(command) as process:
         stack.callback(process.terminate)
-        # The worker waits for its router at first, and loses it later.
+        # The worker first waits for its router, and later loses it.
         with open_session(router(endpoint)):
             session = stack.enter_context(open_session(client(endpoint)))
             wait_for(lambda: list(session.liveliness().get(keys.sim_alive("routed"), timeout=READY_SECONDS)))
@@ -331,7 +331,7 @@ def test_name_of_a_worker_that_died_is_taken_over() -> None:
             claim_name(heir, "late", stop)
 
 
-def test_name_is_not_free_for_the_reason_that_the_router_is_lost() -> None:
+def test_name_does_not_become_free_by_the_loss_of_the_router() -> None:
     endpoint = free_endpoint()
     stop = threading.Event()
     with ExitStack() as stack:
@@ -355,10 +355,10 @@ def test_name_is_not_free_for_the_reason_that_the_router_is_lost() -> None:
     ("options", "message"),
     [({"worker": "a/b"}, "worker: expected a name"), ({"max_steps": 501}, "max_steps: expected 1 to 500, got 501")],
 )
-def test_configuration_at_fault_is_refused(options: dict[str, str], message: str) -> None:
+def test_invalid_configuration_is_refused(options: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ServeConfig(**options)  # pyright: ignore[reportArgumentType]
 
 
-def test_no_task_refuses_as_many_steps() -> None:
+def test_every_task_allows_the_largest_step_limit() -> None:
     assert SawyerXYZEnv.max_path_length == MAX_STEPS

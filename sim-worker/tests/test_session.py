@@ -57,7 +57,7 @@ def commit(session: zenoh.Session, episode: str, timeout_seconds: float) -> None
 
 @pytest.fixture
 def peers(session: zenoh.Session, endpoint: str) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    """Two peers that know nothing but the endpoint of a third."""
+    """Two peers that know only the endpoint of a third."""
     with ExitStack() as stack:
         config = ZenohConfig(connect=(endpoint,))
         yield stack.enter_context(open_session(config)), stack.enter_context(open_session(config))
@@ -73,7 +73,7 @@ def test_peers_reach_each_other_through_a_shared_endpoint(peers: tuple[zenoh.Ses
     alive.undeclare()
 
 
-def test_environment_stands_in_for_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_environment_variables_replace_missing_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("CA", "CERTIFICATE", "PRIVATE_KEY"):
         monkeypatch.setenv(f"CPN_TLS_{name}", str(tmp_path / name))
     monkeypatch.setenv("CPN_MODE", "client")
@@ -124,7 +124,7 @@ def test_text_is_text_in_options_and_environment(monkeypatch: pytest.MonkeyPatch
     assert (given.zenoh.namespace, given.zenoh.user, given.zenoh.password_file) == (text, text, Path(text))
 
 
-def test_variable_at_fault_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CPN_MODE", "broker")
     with pytest.raises(ConfigError, match="CPN_MODE: expected one of peer, client, router, got 'broker'"):
         ZenohConfig()
@@ -195,7 +195,7 @@ def test_listening_of_a_file_is_held_to_the_same(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"got tcp/\[::\]:0"):
         zenoh_config(ZenohConfig(zenoh_config=file))
     zenoh_config(ZenohConfig(zenoh_config=file, listen=("tcp/127.0.0.1:0",)))
-    # Zenoh's defaults have a client listen nowhere.
+    # By zenoh's defaults a client does not listen.
     zenoh_config(ZenohConfig(zenoh_config=file, mode="client", connect=("tcp/127.0.0.1:1",)))
 
 
@@ -216,7 +216,7 @@ def test_worker_that_would_listen_beyond_the_loopback_does_not_start() -> None:
         ({"user": "a", "password_file": Path("/")}, r"--password-file \(CPN_PASSWORD_FILE\): .* got /: Is a dir"),
     ],
 )
-def test_option_at_fault_is_named(options: dict[str, object], message: str) -> None:
+def test_invalid_option_is_named(options: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         zenoh_config(ZenohConfig(**options))  # pyright: ignore[reportArgumentType]
 
@@ -229,7 +229,7 @@ def test_malformed_file_is_refused(text: str, tmp_path: Path) -> None:
         zenoh_config(ZenohConfig(zenoh_config=file))
 
 
-def test_answers_that_do_not_come_are_told_apart() -> None:
+def test_missing_answers_have_distinct_errors() -> None:
     endpoint = free_endpoint()
     held: list[zenoh.Query] = []
     with ExitStack() as stack:
@@ -251,7 +251,7 @@ def test_answers_that_do_not_come_are_told_apart() -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_client_waits_for_its_router_and_says_so(session_log: Log) -> None:
+def test_client_waits_for_its_router_with_warnings(session_log: Log) -> None:
     endpoint = free_endpoint()
     joined, done = threading.Event(), threading.Event()
 
@@ -287,7 +287,7 @@ def test_loss_of_the_router_is_logged_and_so_is_its_return(session_log: Log) -> 
             assert is_connected(session)
 
 
-def test_client_takes_the_router_that_is_there(session_log: Log) -> None:
+def test_client_uses_the_available_router(session_log: Log) -> None:
     missing, endpoint = free_endpoint(), free_endpoint()
     with open_session(router(endpoint)), open_session(client(missing, endpoint)) as session:
         assert is_connected(session)
@@ -306,7 +306,7 @@ def test_wait_for_a_router_can_be_stopped_and_bounded() -> None:
 
 @pytest.mark.parametrize("silent", [False, True])
 def test_sigterm_ends_a_worker_that_waits_for_its_router(silent: bool) -> None:
-    """Behind the endpoint is nothing, or something that never says a word."""
+    """The endpoint is closed, or open and silent."""
     with socket.socket() as listener:
         endpoint = free_endpoint()
         if silent:

@@ -67,7 +67,7 @@ def test_frame_changes_when_the_arm_moves(simulator: Simulator) -> None:
 
 
 def test_two_processes_draw_every_task_alike() -> None:
-    """At the same time, and whatever was drawn before: one goes through the tasks backwards."""
+    """Frames are equal in concurrent processes, whatever was drawn before: one goes through the tasks backwards."""
     forth, back = start_walk(*TASKS), start_walk(*reversed(TASKS))
     first, second = (process.communicate()[0].split() for process in (forth, back))
     frames = len(first) // len(TASKS)

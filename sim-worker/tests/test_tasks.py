@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""The parts of docs/decisions/0006-task-list.md that models can decide."""
+"""Rule of docs/decisions/0006-task-list.md, as far as it can be checked on the models."""
 
 import mujoco
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("quick")
 
 
 class Authority:
-    """A certificate authority, and a folder for what it issues."""
+    """Certificate authority, with a folder of issued certificates."""
 
     def __init__(self, folder: Path) -> None:
         self._authority = trustme.CA(organization_name=folder.name)
@@ -36,7 +36,7 @@ class Authority:
         self._authority.cert_pem.write_to_path(self.certificate)
 
     def issue(self, name: str, host: str = "localhost", *, expired: bool = False) -> tuple[Path, Path]:
-        """A certificate and its key."""
+        """Issues a certificate with its key."""
         end = datetime.now(UTC) + timedelta(days=-1 if expired else 1)
         issued = self._authority.issue_cert(host, common_name=name, not_before=end - timedelta(days=2), not_after=end)
         certificate, private_key = self._folder / f"{name}.pem", self._folder / f"{name}.key"
@@ -86,7 +86,9 @@ def test_members_talk_over_mutual_tls(authority: Authority, endpoint: str) -> No
         queryable.undeclare()
 
 
-def test_nobody_else_gets_in(authority: Authority, endpoint: str, tmp_path: Path, session_log: Log) -> None:
+def test_clients_without_a_valid_certificate_are_refused(
+    authority: Authority, endpoint: str, tmp_path: Path, session_log: Log
+) -> None:
     others = Authority(tmp_path / "others")
     nameless = tmp_path / "nameless.json5"
     tls = {"root_ca_certificate": str(authority.certificate)}
@@ -94,7 +96,7 @@ def test_nobody_else_gets_in(authority: Authority, endpoint: str, tmp_path: Path
     with open_session(member("router", endpoint, authority, authority.issue("router"))) as router:
         without = ZenohConfig(mode="client", connect=(endpoint,), zenoh_config=nameless)
         assert_not_let_in(without, session_log, "alert certificate required")
-        # The authority's certificate is public; the client's own is what counts.
+        # The authority's certificate is public; a client needs one of its own.
         foreign = member("client", endpoint, authority, others.issue("worker"))
         assert_not_let_in(foreign, session_log, "alert unknown ca")
         late = member("client", endpoint, authority, authority.issue("late", expired=True))
@@ -135,7 +137,7 @@ def test_router_without_tls_is_not_joined(authority: Authority, endpoint: str, s
         assert not router.info.transports()
 
 
-def test_loss_of_a_router_over_tls_is_mended(authority: Authority, endpoint: str, session_log: Log) -> None:
+def test_client_reconnects_to_a_router_over_tls(authority: Authority, endpoint: str, session_log: Log) -> None:
     routing = member("router", endpoint, authority, authority.issue("router"))
     with ExitStack() as stack:
         with open_session(routing):
@@ -145,9 +147,7 @@ def test_loss_of_a_router_over_tls_is_mended(authority: Authority, endpoint: str
             wait_for(lambda: is_connected(client))
 
 
-def test_files_at_fault_are_refused_before_anything_is_joined(
-    authority: Authority, endpoint: str, tmp_path: Path
-) -> None:
+def test_invalid_files_are_refused_before_connecting(authority: Authority, endpoint: str, tmp_path: Path) -> None:
     certificate, private_key = authority.issue("worker")
     _, another_key = authority.issue("another")
     garbage = tmp_path / "garbage.pem"

@@ -31,7 +31,7 @@ def test_action_round_trip() -> None:
 @pytest.mark.parametrize(
     "values", [[], [0.0] * 3, [0.0] * 5, [float("nan"), 0, 0, 0], [0, float("inf"), 0, 0], [0, 0, 0, 1.001]]
 )
-def test_action_at_fault_is_named(values: list[float]) -> None:
+def test_invalid_action_is_named(values: list[float]) -> None:
     with pytest.raises(RequestError) as caught:
         action_from_proto(types_pb2.Action(values=values), 4, "action")
     assert caught.value.field == "action.values"
@@ -40,7 +40,7 @@ def test_action_at_fault_is_named(values: list[float]) -> None:
 
 @pytest.mark.parametrize("payload", [b"\x0a\x7f", b"\xff" * 20, b"\0" * (MAX_PAYLOAD_BYTES + 1)])
 def test_undecodable_payload_is_refused(payload: bytes) -> None:
-    """A length past the end, an endless varint, and more than any request needs."""
+    """A length past the end, an endless varint, and an oversized payload."""
     with pytest.raises(RequestError) as caught:
         decode(sim_pb2.ResetRequest, payload)
     assert caught.value.field == "payload"

@@ -1,9 +1,9 @@
-//! Steps that make an episode.
+//! Demonstration episodes.
 
 use wire::Error;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
 
-/// T actions with the frames before, between and after them, and what is known of the whole. One that is built is right.
+/// Valid demonstration episode: its metadata, and T + 1 steps with T actions; the last frame is the goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     info: RecordedEpisode,
@@ -11,17 +11,18 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Puts the steps of a stream together. `steps` are in order and complete.
+    /// Episode of these steps, in order and complete.
     ///
     /// # Errors
-    /// Names the step and field that does not fit: steps that are missing or of another episode, frames of several sizes
-    /// or render specs, an action that is missing, too many, of another width or not in [-1, 1], states of several
-    /// widths, or steps whose digest is not that of `info`.
+    /// If steps are missing or of another episode; frames differ in size or render spec; an action is missing, is one too
+    /// many, has another width or is not in [-1, 1]; states differ in width; or the steps' digest is not that of `info`. The
+    /// error names the step and field.
     pub fn new(info: RecordedEpisode, steps: Vec<DemonstrationStep>) -> Result<Self, Error> {
         check("steps", info.steps as usize, steps.len())?;
         let [first, .., last] = &steps[..] else {
             return Err(Error::invalid("steps", "at least 2", steps.len()));
         };
+
         for (number, step) in (0..).zip(&steps) {
             let fits = || {
                 check("step", number, step.step)?;
@@ -33,21 +34,22 @@ impl Episode {
             };
             fits().map_err(|e| e.within(&format!("steps[{number}]")))?;
         }
+
         check("digest", &info.digest, &digest(&steps))?;
         Ok(Self { info, steps })
     }
 
-    /// What its sender committed.
+    /// Metadata, as committed by the sender.
     pub fn info(&self) -> &RecordedEpisode {
         &self.info
     }
 
-    /// The steps in order, at least 2.
+    /// Steps in order, at least 2.
     pub fn steps(&self) -> &[DemonstrationStep] {
         &self.steps
     }
 
-    /// The steps in order, at least 2.
+    /// Steps in order, at least 2.
     pub fn into_steps(self) -> Vec<DemonstrationStep> {
         self.steps
     }

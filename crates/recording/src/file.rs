@@ -1,4 +1,4 @@
-//! MCAP files of protobuf messages: written in one go, and read as a stranger's.
+//! MCAP files of protobuf messages: a writer into memory, and a reader of untrusted files.
 
 use crate::MAX_BYTES;
 use crate::records::{Channels, Message};
@@ -12,26 +12,26 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 use wire::Error;
 
-/// Frames compress against those before them in the same chunk, so that a chunk holds a whole episode of usual length.
+/// Chunk size, in bytes: an episode of usual length, since a frame compresses only against earlier ones of its chunk.
 const CHUNK_BYTES: u64 = 4 << 20;
-/// Most that is read at a time: what a record claims to have may not be there.
+/// Largest read, in bytes: the claimed length of a record is not trusted.
 const READ_BYTES: usize = 64 << 10;
 
-/// Why a recording was refused.
+/// Error of reading a recording.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The file could not be read.
+    /// Unreadable file.
     #[error("recording: {0}")]
     Io(#[from] std::io::Error),
-    /// Not a whole and undamaged MCAP file.
+    /// Truncated or damaged MCAP file.
     #[error("recording: {}", reason(.0))]
     Mcap(#[from] McapError),
-    /// Undamaged, but not the recording that is expected.
+    /// Intact MCAP file that is not the expected recording.
     #[error("recording: {0}")]
     Content(#[from] Error),
 }
 
-/// The error with what caused it, which MCAP's own message leaves out.
+/// The error with its cause, which MCAP's own message leaves out.
 fn reason(error: &McapError) -> String {
     match error {
         McapError::Parse(cause) => format!("{error}: {cause}"),
@@ -40,7 +40,7 @@ fn reason(error: &McapError) -> String {
     }
 }
 
-/// A file that is being written. The same messages give the same bytes.
+/// Deterministic MCAP writer: the same messages give the same bytes.
 pub(crate) struct Writer {
     writer: mcap::Writer<Cursor<Vec<u8>>>,
     channels: Vec<(Topic, u16)>,
@@ -51,7 +51,7 @@ impl Writer {
         let options = WriteOptions::new()
             .library("cpn")
             .chunk_size(Some(CHUNK_BYTES))
-            // Threads would only change how the time is spent, and one file takes little.
+            // One file takes too little time for threads to pay off.
             .compression_threads(0);
         let mut writer = options.create(Cursor::new(Vec::new()))?;
         let channels = topics.iter().map(|&topic| {
@@ -62,7 +62,10 @@ impl Writer {
         Ok(Self { writer, channels })
     }
 
-    /// Adds a message at one of the topics; `time` is in nanoseconds since the start of the episode.
+    /// Appends a message; `time` is in nanoseconds since the start of the episode.
+    ///
+    /// # Panics
+    /// If the topic is not one that the writer was created with.
     pub(crate) fn write(
         &mut self,
         topic: Topic,
@@ -76,7 +79,7 @@ impl Writer {
         self.writer.write_to_known_channel(&header, &message.encode_to_vec())
     }
 
-    /// Lets what follows begin a chunk.
+    /// Ends the current chunk.
     pub(crate) fn end_chunk(&mut self) -> Result<(), McapError> {
         self.writer.flush()
     }
@@ -87,7 +90,7 @@ impl Writer {
     }
 }
 
-/// The bytes of a file, if there are not too many.
+/// Reads a file of at most [`MAX_BYTES`].
 pub(crate) fn bytes(path: &Path) -> Result<Vec<u8>, ReadError> {
     let mut bytes = Vec::new();
     File::open(path)?.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes)?;
@@ -95,14 +98,14 @@ pub(crate) fn bytes(path: &Path) -> Result<Vec<u8>, ReadError> {
     Ok(bytes)
 }
 
-/// The messages of a file, checked and bounded.
+/// MCAP reader with checksums verified and sizes bounded.
 pub(crate) struct Reader<R> {
     source: R,
     reader: LinearReader,
     channels: Channels,
-    /// Of all records so far.
+    /// Size of all records read so far.
     bytes: usize,
-    /// Whether what follows only repeats what came.
+    /// Whether the summary section has been reached, which only repeats the data section.
     in_summary: bool,
 }
 
@@ -140,7 +143,7 @@ impl<R: Read> Reader<R> {
         Ok(None)
     }
 
-    /// The next message, which must be of this topic and its schema.
+    /// Reads the next message, which must be of this topic and its schema.
     pub(crate) fn of(&mut self, topic: Topic) -> Result<Message, ReadError> {
         let name = topic.name();
         let message = self.next()?.ok_or_else(|| Error::invalid(name, "a message", "the end of the file"))?;
@@ -151,7 +154,7 @@ impl<R: Read> Reader<R> {
         Ok(message)
     }
 
-    /// Reads to the end of the file, where its last checksums are: nothing may follow the last step of `field`.
+    /// Reads to the end of the file, whose footer has the last checksums; no message may follow the last step of `field`.
     pub(crate) fn end(&mut self, field: &str, last: u32) -> Result<(), ReadError> {
         match self.next()? {
             None => Ok(()),

@@ -1,8 +1,8 @@
-//! Recordings: one episode in one MCAP file, which Foxglove, Rerun and every MCAP library can read.
+//! Recordings: one episode per MCAP file, readable by Foxglove, Rerun and every MCAP library.
 //!
-//! [`Episode`] is a demonstration, steps that fit together; [`to_bytes`] and [`from_bytes`] are the file. The messages are
-//! `RawImage` of Foxglove's schemas at `/camera` and those of `proto/cpn/v1/demonstration.proto` beside it. [`plans`] are
-//! what a planner was asked in an episode and what it answered, as `proto/cpn/v1/replay.proto` says.
+//! [`Episode`] is a validated demonstration; [`to_bytes`] and [`from_bytes`] encode and decode its file. The messages are
+//! Foxglove's `RawImage` at `/camera`, and those of `proto/cpn/v1/demonstration.proto`. [`plans`] are recordings of an
+//! episode's plan requests and responses, with the messages of `proto/cpn/v1/replay.proto`.
 
 mod episode;
 mod file;
@@ -17,7 +17,7 @@ pub use file::ReadError;
 pub use read::{from_bytes, read, read_header};
 pub use write::to_bytes;
 
-/// How the names of recordings end.
+/// File name extension of recordings.
 pub const EXTENSION: &str = "mcap";
-/// Largest recording that is read, in bytes, compressed or not: three times the longest episode of 84 x 84 frames.
+/// Largest recording, in bytes, compressed or not: three times the longest episode of 84 x 84 frames.
 pub const MAX_BYTES: usize = 64 << 20;

@@ -1,4 +1,4 @@
-//! The plans of an episode as an MCAP file: every request to a planner and its answer, as they were.
+//! Recorded plans of an episode, in one MCAP file: every plan request with its response.
 
 use crate::ReadError;
 use crate::file::{Reader, Writer, bytes, check, check_size};
@@ -11,20 +11,20 @@ use wire::planner::{Goal, PlanRequest, PlanResponse};
 use wire::replay::PlannedEpisode;
 use wire::{Error, Message, Observation, decode, proto};
 
-/// A request and its answer.
+/// Plan request and its response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exchange {
-    /// As it was sent.
+    /// Request, as sent.
     pub request: PlanRequest,
-    /// When, since the start of the episode.
+    /// Time of the request, since the start of the episode.
     pub asked: Duration,
-    /// As it came.
+    /// Response, as received.
     pub response: PlanResponse,
-    /// When, since the start of the episode.
+    /// Time of the response, since the start of the episode.
     pub answered: Duration,
 }
 
-/// The plans of an episode. Those that are built are of one model's checkpoint and towards one goal.
+/// Valid plans of an episode: all by one checkpoint and towards one goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plans {
     episode: PlannedEpisode,
@@ -32,18 +32,18 @@ pub struct Plans {
 }
 
 impl Plans {
-    /// Puts the plans of an episode together, in the order of the steps.
+    /// Plans of an episode, in the order of the steps.
     ///
     /// # Errors
-    /// Names the step and field that does not fit: another model, checkpoint or goal than the episode's, or another number
-    /// of plans.
+    /// If their number, or the model, checkpoint or goal of one of them, is not that of the episode. The error names the step
+    /// and field.
     pub fn new(episode: PlannedEpisode, exchanges: Vec<Exchange>) -> Result<Self, Error> {
         check("plans", &episode.plans.to_string(), &exchanges.len().to_string())?;
-        let goal_id = episode.goal.digest();
+        let expected_goal = episode.goal.digest();
         for (step, Exchange { request, response, .. }) in exchanges.iter().enumerate() {
             let fits = || {
                 check("request.model", &episode.model, &request.model)?;
-                check("request.goal", &goal_id, &id(&request.goal))?;
+                check("request.goal", &expected_goal, &goal_id(&request.goal))?;
                 check("response.model_digest", &episode.model_digest, &response.model_digest)
             };
             fits().map_err(|e| e.within(&format!("plans[{step}]")))?;
@@ -51,19 +51,19 @@ impl Plans {
         Ok(Self { episode, exchanges })
     }
 
-    /// What is known of the episode.
+    /// Metadata of the episode.
     pub fn episode(&self) -> &PlannedEpisode {
         &self.episode
     }
 
-    /// The plans in the order of the steps, at least one.
+    /// Plans in the order of the steps, at least one.
     pub fn exchanges(&self) -> &[Exchange] {
         &self.exchanges
     }
 }
 
-/// The id under which a planner knows a goal.
-fn id(goal: &Goal) -> String {
+/// Goal id, as planners compute it.
+fn goal_id(goal: &Goal) -> String {
     match goal {
         Goal::Id(id) => id.clone(),
         Goal::Image(image) => image.digest(),
@@ -71,7 +71,7 @@ fn id(goal: &Goal) -> String {
     }
 }
 
-/// The recording of an episode's plans.
+/// Encodes the recording of an episode's plans.
 ///
 /// # Errors
 /// If the encoder fails.
@@ -87,11 +87,10 @@ pub fn to_bytes(plans: &Plans) -> Result<Vec<u8>, McapError> {
     writer.finish()
 }
 
-/// Reads the recording of an episode's plans.
+/// Decodes the recording of an episode's plans: a header, then each request and its response, in order.
 ///
 /// # Errors
-/// If it is too large, truncated, damaged (every part has a checksum), or does not hold the plans of one episode: a
-/// header, then each request and its answer, in order.
+/// If it is too large, truncated, damaged (every part has a checksum), or not the plans of one episode.
 pub fn from_bytes(bytes: &[u8]) -> Result<Plans, ReadError> {
     check_size(bytes.len())?;
     let mut reader = Reader::new(bytes);
@@ -102,6 +101,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Plans, ReadError> {
         let (response, answered) = of_step(&mut reader, Topic::PlanResponse, step)?;
         exchanges.push(Exchange { request, asked, response, answered });
     }
+
     reader.end("plans", episode.plans - 1)?;
     Ok(Plans::new(episode, exchanges)?)
 }
@@ -114,7 +114,7 @@ pub fn read(path: &Path) -> Result<Plans, ReadError> {
     from_bytes(&bytes(path)?)
 }
 
-/// The next message, which must be of this topic and step, and its time.
+/// Reads the next message, which must be of this topic and step, and its time.
 fn of_step<M: Message>(reader: &mut Reader<impl Read>, topic: Topic, step: u32) -> Result<(M, Duration), ReadError> {
     let message = reader.of(topic)?;
     check(topic.name(), &format!("number {step}"), &format!("number {}", message.sequence))?;

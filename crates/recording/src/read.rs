@@ -1,4 +1,4 @@
-//! An episode from the bytes of a file, which a stranger may have written.
+//! Decoding of episodes from untrusted files.
 
 use crate::Episode;
 use crate::file::{ReadError, Reader, bytes, check, check_size};
@@ -11,11 +11,10 @@ use std::path::Path;
 use wire::demonstration::{RecordedEpisode, RecordedStep};
 use wire::{Error, Image, decode};
 
-/// Reads a recording.
+/// Decodes a recording: a header, then each step's frame and the step, in order.
 ///
 /// # Errors
-/// If it is too large, truncated, damaged (every part has a checksum), or does not hold one episode: a header, then each
-/// step's frame and the step, in order, that together have the header's digest.
+/// If it is too large, truncated, damaged (every part has a checksum), or not one valid episode with the header's digest.
 pub fn from_bytes(bytes: &[u8]) -> Result<Episode, ReadError> {
     check_size(bytes.len())?;
     let mut reader = Reader::new(bytes);
@@ -30,11 +29,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Episode, ReadError> {
             .map_err(|e: Error| e.within(&format!("/step[{number}]")))?;
         steps.push(step.with_frame(info.episode_id.clone(), frame));
     }
+
     reader.end("steps", info.steps - 1)?;
     Ok(Episode::new(info, steps)?)
 }
 
-/// Reads a recording's file.
+/// Reads the file of a recording.
 ///
 /// # Errors
 /// As [`from_bytes`], or if the file cannot be read.
@@ -42,7 +42,7 @@ pub fn read(path: &Path) -> Result<Episode, ReadError> {
     from_bytes(&bytes(path)?)
 }
 
-/// Reads the header alone, which comes first; whatever follows is not looked at.
+/// Reads only the header, which comes first; the rest of the file is not checked.
 ///
 /// # Errors
 /// If the file cannot be read, or does not begin with an undamaged header.

@@ -1,14 +1,13 @@
-//! The records of an MCAP file that matter here: schemas, channels and messages.
+//! Parser of MCAP's schema, channel and message records.
 //!
-//! They are read by hand, since the library's parser makes room for whatever length a text claims: 4 GiB in a file of a few
-//! bytes.
+//! Hand-written, since the library's parser allocates the length that a string claims: 4 GiB for a file of a few bytes.
 
 use mcap::records::op;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 use wire::Error;
 
-/// What a channel says of its messages.
+/// Channel: topic, schema and encoding of its messages.
 pub(crate) struct Channel {
     pub(crate) topic: String,
     /// Name and encoding of the messages' schema.
@@ -16,7 +15,7 @@ pub(crate) struct Channel {
     pub(crate) encoding: String,
 }
 
-/// A message.
+/// Message with its channel; `log_time` is in nanoseconds since the start of the episode.
 pub(crate) struct Message {
     pub(crate) channel: Rc<Channel>,
     pub(crate) sequence: u32,
@@ -24,7 +23,7 @@ pub(crate) struct Message {
     pub(crate) data: Vec<u8>,
 }
 
-/// The channels so far, and the schemas that they name.
+/// Channels and schemas read so far, by id.
 #[derive(Default)]
 pub(crate) struct Channels {
     schemas: BTreeMap<u16, Rc<str>>,
@@ -32,9 +31,10 @@ pub(crate) struct Channels {
 }
 
 impl Channels {
-    /// Keeps what a record says of channels; gives the message, if it is one.
+    /// Registers a schema or channel record; returns the message of a message record.
     pub(crate) fn read(&mut self, opcode: u8, record: &[u8]) -> Result<Option<Message>, Error> {
         let mut fields = Fields(record);
+
         match opcode {
             op::SCHEMA => {
                 let (id, name, encoding) = (fields.u16()?, fields.text()?, fields.text()?);
@@ -59,7 +59,7 @@ impl Channels {
     }
 }
 
-/// What is left of a record: numbers, and texts after their lengths.
+/// Unread rest of a record: little-endian integers, and strings prefixed by their lengths.
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {

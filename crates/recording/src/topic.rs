@@ -1,4 +1,4 @@
-//! Topics, schemas and times of a recording.
+//! Topics, schemas and log times of recordings.
 
 use foxglove::Encode;
 use foxglove::messages::RawImage;
@@ -6,14 +6,14 @@ use prost::{Message as _, Name};
 use prost_types::FileDescriptorSet;
 use wire::proto;
 
-/// How messages and schemas are encoded.
+/// Encoding of messages and schemas.
 pub(crate) const ENCODING: &str = "protobuf";
-/// How pixels are laid out, in the words of [`RawImage`].
+/// Pixel format, as [`RawImage`] names it.
 pub(crate) const PIXELS: &str = "rgb8";
 /// Name of the camera's frame of reference.
 pub(crate) const FRAME_ID: &str = "camera";
 
-/// Which messages are where.
+/// Topics, each with its message type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Topic {
     /// `cpn.v1.RecordedEpisode`, first and once.
@@ -53,7 +53,7 @@ impl Topic {
         }
     }
 
-    /// The message and everything it refers to, as a `FileDescriptorSet`.
+    /// Encoded `FileDescriptorSet` of the message and the types it refers to.
     pub(crate) fn schema(self) -> Vec<u8> {
         match self {
             Self::Camera => schema_of_camera().data.into_owned(),
@@ -68,14 +68,14 @@ fn schema_of_camera() -> foxglove::Schema {
     RawImage::get_schema().expect("every message of Foxglove has a schema")
 }
 
-/// A file and the types it refers to, and no other, so that a change of any other leaves recordings as they are.
+/// Schema of one `.proto` file and its imports alone, so that changes of other files leave recordings as they are.
 fn schema_of(file_name: &str) -> Vec<u8> {
     let mut all = FileDescriptorSet::decode(proto::DESCRIPTORS).expect("the build script encoded them");
     all.file.retain(|file| ["cpn/v1/types.proto", file_name].contains(&file.name()));
     all.encode_to_vec()
 }
 
-/// When a step is, in nanoseconds since the start of the episode.
+/// Time of a step, in nanoseconds since the start of the episode.
 pub(crate) fn log_time_nanos(step: u32, control_hz: f64) -> u64 {
     (f64::from(step) * 1e9 / control_hz).round() as u64
 }

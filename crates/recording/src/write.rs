@@ -1,4 +1,4 @@
-//! An episode as the bytes of a file.
+//! Encoding of episodes.
 
 use crate::Episode;
 use crate::file::Writer;
@@ -8,14 +8,14 @@ use mcap::McapError;
 use wire::demonstration::{DemonstrationStep, RecordedStep};
 use wire::proto;
 
-/// The recording of an episode. The same episode gives the same bytes.
+/// Encodes the recording of an episode, deterministically.
 ///
 /// # Errors
 /// If the encoder fails.
 pub fn to_bytes(episode: &Episode) -> Result<Vec<u8>, McapError> {
     let mut writer = Writer::new(&[Topic::Episode, Topic::Camera, Topic::Step])?;
     writer.write(Topic::Episode, 0, 0, &proto::RecordedEpisode::from(episode.info().clone()))?;
-    // The header has a chunk of its own: whoever wants only that need not decompress a frame.
+    // The header has a chunk of its own, so that it can be read without decompressing a frame.
     writer.end_chunk()?;
     for step in episode.steps() {
         let time = log_time_nanos(step.step, episode.info().control_hz);

@@ -1,4 +1,4 @@
-//! The plans of an episode come back as they were; what holds none is refused.
+//! Round trip of an episode's plans, and refusals of other files.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -57,11 +57,11 @@ fn exchanges() -> Vec<Exchange> {
 }
 
 #[test]
-fn plans_come_back_whole() {
+fn plans_round_trip() {
     let plans = Plans::new(episode(3), exchanges()).unwrap();
     let read = from_bytes(&to_bytes(&plans).unwrap()).unwrap();
     assert_eq!(read, plans);
-    // Equality takes -0 for 0.
+    // Equality alone would take -0 for 0.
     let bits = |plans: &Plans| -> Vec<u32> {
         plans.exchanges().iter().flat_map(|e| e.response.actions.concat()).map(f32::to_bits).collect()
     };
@@ -69,7 +69,7 @@ fn plans_come_back_whole() {
 }
 
 #[test]
-fn a_cut_file_is_refused() {
+fn a_truncated_file_is_refused() {
     let good = to_bytes(&Plans::new(episode(3), exchanges()).unwrap()).unwrap();
     for length in (0..good.len()).step_by(41) {
         assert!(from_bytes(&good[..length]).is_err(), "{length}");
@@ -77,7 +77,7 @@ fn a_cut_file_is_refused() {
 }
 
 #[test]
-fn what_does_not_fit_is_named() {
+fn inconsistent_plans_are_refused_with_the_field() {
     type Spoil = fn(&mut PlannedEpisode, &mut Vec<Exchange>);
     let cases: [(Spoil, &str); 4] = [
         (|_, e| drop(e.pop()), "plans: expected 3, got 2"),
@@ -93,16 +93,16 @@ fn what_does_not_fit_is_named() {
     }
 }
 
-/// A demonstration is a recording too, and the plans of an episode are no demonstration.
+/// A file of plans is refused as a demonstration, and the reverse.
 #[test]
-fn the_two_kinds_are_told_apart() {
+fn plans_and_demonstrations_are_not_confused() {
     let plans = to_bytes(&Plans::new(episode(3), exchanges()).unwrap()).unwrap();
     let error = recording::from_bytes(&plans).unwrap_err().to_string();
     let expected = "cpn.v1.RecordedEpisode as protobuf, got cpn.v1.PlannedEpisode as protobuf";
     assert_eq!(error, format!("recording: /episode.schema: expected {expected}"));
 }
 
-/// What a viewer sees: the topics with their schemas, and messages that know their time.
+/// View of any MCAP library: topics with schemas, and messages with log times.
 #[test]
 fn any_mcap_library_reads_it() {
     let bytes = to_bytes(&Plans::new(episode(3), exchanges()).unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! Recordings come back as they were; damaged ones are refused, whatever is damaged.
+//! Round trip of recordings, and refusals of damaged ones.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -14,7 +14,7 @@ use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
 use wire::sim::Variation;
 use wire::{Image, proto};
 
-/// The steps of an episode of small pictures.
+/// Steps of an episode with small images.
 fn steps(count: u32, side: u32, spec: &str) -> Vec<DemonstrationStep> {
     let step = |step: u32| {
         let pixels = (0..side * side * 3).map(|i| (i * 31 + step * 7) as u8).collect();
@@ -52,7 +52,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn an_episode_comes_back_whole(
+    fn an_episode_round_trips(
         count in 2u32..7,
         (height, width) in (1u32..9, 1u32..9),
         spec in "\\PC{0,30}",
@@ -79,7 +79,7 @@ proptest! {
     }
 }
 
-/// Every byte counts, wherever it lies: in records, indexes, checksums or the magic of the file.
+/// Flips every byte in turn, in records, indexes, checksums and the file's magic.
 #[test]
 fn a_flipped_byte_is_refused_or_changes_nothing() {
     let episode = episode(3, 2);
@@ -99,7 +99,7 @@ fn a_flipped_byte_is_refused_or_changes_nothing() {
 }
 
 #[test]
-fn a_cut_file_is_refused() {
+fn a_truncated_file_is_refused() {
     let good = to_bytes(&episode(3, 2)).unwrap();
     for length in 0..good.len() {
         assert!(matches!(from_bytes(&good[..length]), Err(ReadError::Mcap(_) | ReadError::Content(_))), "{length}");
@@ -107,9 +107,9 @@ fn a_cut_file_is_refused() {
     assert!(from_bytes(&[&good[..], b"x"].concat()).is_err(), "nothing may follow the end");
 }
 
-/// Lengths within a record may lead anywhere, where there are no checksums.
+/// Lengths inside a record are not trusted: a file may have no checksums.
 #[test]
-fn a_record_is_not_taken_at_its_word() {
+fn lengths_inside_records_are_not_trusted() {
     let record = |opcode: u8, data: &[u8]| [&[opcode][..], &(data.len() as u64).to_le_bytes(), data].concat();
     let refusal = |records: &[u8]| from_bytes(&[mcap::MAGIC, records].concat()).unwrap_err().to_string();
 
@@ -117,7 +117,7 @@ fn a_record_is_not_taken_at_its_word() {
     let error = "recording: record: expected 4294967295 bytes more, got 4";
     assert_eq!(refusal(&record(op::SCHEMA, &endless)), error);
 
-    // A chunk of 9 bytes begins a message of 100.
+    // A chunk of 9 bytes, with the begin of a message of 100.
     let message = record(op::MESSAGE, &[0; 100]);
     let chunk = [&[0; 32][..], &9u64.to_le_bytes(), &message[..9]].concat();
     let error = "recording: channel: expected a known one, got 0";
@@ -143,7 +143,7 @@ fn the_header_is_read_without_the_rest() {
     assert_eq!(recording::read(&path).unwrap(), episode);
 }
 
-/// A message on its way into a spoiled file.
+/// Message of a file to be spoiled.
 struct Raw {
     topic: String,
     schema: String,
@@ -151,7 +151,7 @@ struct Raw {
     data: Vec<u8>,
 }
 
-/// The refusal of a whole, undamaged MCAP file with other contents.
+/// Refusal of an intact MCAP file with other contents.
 fn refusal(spoil: impl FnOnce(&mut Vec<Raw>)) -> String {
     let good = to_bytes(&episode(3, 2)).unwrap();
     let mut messages: Vec<Raw> = MessageStream::new(&good)
@@ -185,7 +185,7 @@ fn edit<M: prost::Message + Default>(raw: &mut Raw, edit: impl FnOnce(&mut M)) {
 }
 
 #[test]
-fn undamaged_files_that_hold_no_episode_are_refused() {
+fn intact_files_without_a_valid_episode_are_refused() {
     let refusals = [
         (refusal(|m| m.clear()), "/episode: expected a message, got the end of the file"),
         (refusal(|m| drop(m.remove(0))), "topic: expected /episode, got /camera"),
@@ -223,7 +223,7 @@ fn undamaged_files_that_hold_no_episode_are_refused() {
 }
 
 #[test]
-fn steps_that_do_not_fit_are_named() {
+fn inconsistent_steps_are_refused_with_the_field() {
     type Spoil = fn(&mut RecordedEpisode, &mut Vec<DemonstrationStep>);
     let cases: [(Spoil, &str); 11] = [
         (|_, s| drop(s.pop()), "steps: expected 3, got 2"),
@@ -249,7 +249,7 @@ fn steps_that_do_not_fit_are_named() {
     }
 }
 
-/// What a viewer sees: the topics, their schemas, and frames that know their time.
+/// View of any MCAP library: topics with schemas, and frames with timestamps.
 #[test]
 fn any_mcap_library_reads_it() {
     let bytes = to_bytes(&episode(3, 2)).unwrap();

@@ -1,4 +1,4 @@
-//! Telling clients apart: by their certificates, or by bearer tokens.
+//! Authentication and authorisation of clients, by certificate or bearer token.
 
 use crate::files;
 use anyhow::Context;
@@ -11,22 +11,22 @@ use std::path::Path;
 use std::sync::Arc;
 use tracing::warn;
 
-/// Largest file of tokens.
+/// Largest token file, in bytes.
 const MAX_BYTES: usize = 1 << 20;
 
-/// A file of tokens.
+/// Contents of a token file.
 #[derive(Debug, Default, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TokenFile {
-    /// Every token that is accepted.
+    /// Accepted tokens.
     pub tokens: Vec<TokenEntry>,
 }
 
-/// A token that is accepted. It is a secret, so that only its digest is kept.
+/// Accepted token, stored as its digest only, since it is a secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TokenEntry {
-    /// Identity of its bearer, `ROLE` or `ROLE.NAME`.
+    /// Identity of the bearer, `ROLE` or `ROLE.NAME`.
     pub identity: String,
     /// SHA-256 of the token, in hex.
     pub sha256: String,
@@ -37,42 +37,42 @@ pub fn token_digest(token: &str) -> String {
     hex::encode(Sha256::digest(token))
 }
 
-/// A client as its listener sees it.
+/// Remote side of a connection.
 #[derive(Debug, Clone)]
 pub struct Peer {
-    /// Where it connects from.
+    /// Remote address.
     pub address: SocketAddr,
-    /// The common name of its certificate, if it has shown one.
+    /// Common name of the client's certificate, if it presented one.
     pub certificate: Option<String>,
 }
 
-/// Why a client is refused.
+/// Reason for refusing a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
-    /// It has shown nothing.
+    /// Neither certificate nor token.
     #[error("authorization: expected a client certificate or a token, got none")]
     Missing,
-    /// Its token is not known.
+    /// Unknown token.
     #[error("authorization: expected a token that is known, got another")]
     Unknown,
-    /// Its role may not do it.
+    /// Role without the permission.
     #[error("authorization: expected a role that may do this, got another")]
     Forbidden,
 }
 
-/// Decides which clients a listener serves. Without TLS and without tokens, as on the loopback interface, all of them.
+/// Access control of a listener. Without TLS and without tokens, as on the loopback interface, every client is served.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
     required: bool,
-    /// Identities by the digests of their tokens.
+    /// Identities, by the digests of their tokens.
     tokens: Arc<HashMap<String, String>>,
 }
 
 impl Access {
-    /// Access by certificates, if there is TLS, and by the tokens of a file.
+    /// Access control by certificates, if there is TLS, and by the tokens of a file.
     ///
     /// # Errors
-    /// If the file cannot be read or is malformed.
+    /// If the token file cannot be read or is malformed.
     pub fn new(tls: bool, tokens: Option<&Path>) -> anyhow::Result<Self> {
         let required = tls || tokens.is_some();
         let Some(file) = tokens else { return Ok(Self { required, tokens: Arc::default() }) };
@@ -85,11 +85,12 @@ impl Access {
         Ok(Self { required, tokens: Arc::new(tokens) })
     }
 
-    /// Lets a client do something that `allows` says of its identity, or refuses, with a line in the log and a count in
-    /// `cpn_access_refused_total`. `authorization` is the header of the request, `Bearer TOKEN` or `Api-Key TOKEN`.
+    /// Authorises a client for `what`, if `allows` holds for its identity. A refusal is logged, and counted in
+    /// `cpn_access_refused_total`. `authorization` is the request's header, `Bearer TOKEN` or `Api-Key TOKEN`; without one, the
+    /// client's certificate counts.
     ///
     /// # Errors
-    /// Why not.
+    /// If the client has neither certificate nor token, its token is unknown, or its role lacks the permission.
     pub fn check(
         &self,
         peer: &Peer,
@@ -100,6 +101,7 @@ impl Access {
         if !self.required {
             return Ok(());
         }
+
         let identity = match authorization.and_then(|header| header.split_once(' ')) {
             Some((_, token)) => self.tokens.get(&token_digest(token)).ok_or(Refusal::Unknown),
             None => peer.certificate.as_ref().ok_or(Refusal::Missing),
@@ -109,6 +111,7 @@ impl Access {
             Ok(_) => Refusal::Forbidden,
             Err(refusal) => refusal,
         };
+
         let reason = match refusal {
             Refusal::Missing => "missing",
             Refusal::Unknown => "unknown",

@@ -1,8 +1,8 @@
-//! Configuration in layers: the command line over the environment over a file over the defaults.
+//! Layered configuration: the command line over the environment over a file over the defaults.
 //!
-//! A service has one struct of settings, whose fields are options of its command line at the same time: an option's default is
-//! that of the setting. An empty environment variable counts as unset, as orchestrators fill in what nobody has set. The field decides what a text
-//! means, wherever it stands.
+//! A service has one settings struct, whose fields are also the options of its command line and have their defaults. An empty
+//! environment variable counts as unset, since orchestrators set unset ones to the empty string. Text is parsed by the
+//! field's type, in every layer.
 
 use anyhow::bail;
 use clap::builder::Resettable;
@@ -17,23 +17,23 @@ use std::ffi::{OsStr, OsString};
 use std::path::Path;
 use tracing::warn;
 
-/// Similarity of two names, from 0 to 1, from which on one is taken for a misspelling of the other.
+/// Jaro-Winkler similarity, from 0 to 1, at and above which a name is taken for a misspelling of another.
 const NEAR_MISS: f64 = 0.9;
 
-/// Parses the command line; ends the process with a message if it is wrong.
+/// Parses the command line; exits with a message if it is invalid.
 pub fn parse<A: Parser>() -> A {
     parse_with_sources().0
 }
 
-/// The same, and the sources of its options.
+/// Parses the command line, with the sources of its options; exits with a message if it is invalid.
 pub fn parse_with_sources<A: Parser>() -> (A, Sources) {
     parse_from(std::env::args_os()).unwrap_or_else(|error| error.exit())
 }
 
-/// Parses a command line, whose first text is the program's name.
+/// Parses a command line, whose first argument is the program's name.
 ///
 /// # Errors
-/// The message for the user.
+/// If the command line is invalid, with the message for the user.
 pub fn parse_from<A, T>(line: impl IntoIterator<Item = T>) -> Result<(A, Sources), clap::Error>
 where
     A: Parser,
@@ -54,7 +54,7 @@ where
 pub struct Sources(ArgMatches);
 
 impl Sources {
-    /// Given settings: those of `settings` on the command line or in the environment variable of an option.
+    /// Explicit settings: those of `settings` from the command line or an option's environment variable.
     ///
     /// # Errors
     /// If the settings cannot be serialised.
@@ -68,7 +68,7 @@ impl Sources {
         let Some(settings) = settings.as_object_mut() else { return };
         settings.retain(|name, value| match self.0.ids().any(|id| id == name.as_str()) {
             true => self.0.value_source(name) != Some(ValueSource::DefaultValue),
-            // Flattened settings are nested in a file.
+            // Options are flat, and the structs flattened into them are tables in a file.
             false => {
                 self.retain_given(value);
                 value.as_object().is_some_and(|nested| !nested.is_empty())
@@ -77,7 +77,7 @@ impl Sources {
     }
 }
 
-/// The defaults of settings, which are those of their options.
+/// Default settings: the defaults of their options.
 ///
 /// # Panics
 /// If an option has no default.
@@ -87,26 +87,27 @@ pub fn defaults<C: clap::Args>() -> C {
     defaults.expect("every option has a default")
 }
 
-/// Reads from text what has a name in configuration files, for the value of an option.
+/// Parses the value of an option by its name in configuration files.
 ///
 /// # Errors
-/// Names what was expected.
+/// If there is no such value, with the expected names.
 pub fn from_name<T: DeserializeOwned>(name: &str) -> Result<T, serde_json::Error> {
     serde_json::from_value(name.into())
 }
 
-/// A command whose options are not read from environment variables that are to be passed over.
-fn without_variables(command: Command, passed_over: &impl Fn(&OsStr) -> bool) -> Command {
+/// The command without the environment variables of its options that are `ignored`.
+fn without_variables(command: Command, ignored: &impl Fn(&OsStr) -> bool) -> Command {
     let command =
-        command.mut_args(|arg| if arg.get_env().is_some_and(passed_over) { arg.env(Resettable::Reset) } else { arg });
-    command.mut_subcommands(|subcommand| without_variables(subcommand, passed_over))
+        command.mut_args(|arg| if arg.get_env().is_some_and(ignored) { arg.env(Resettable::Reset) } else { arg });
+    command.mut_subcommands(|subcommand| without_variables(subcommand, ignored))
 }
 
-/// Reads a configuration, which is `settings` on the command line. `prefix` starts the names of the environment
-/// variables, `CPN_PLANNER_` for example; nested fields are separated by two underscores.
+/// Loads a configuration of all layers; `settings` and `sources` are those of the command line. `prefix` starts the names of
+/// the environment variables, for example `CPN_PLANNER_`; two underscores separate nested fields.
 ///
 /// # Errors
-/// Names the field, the file or variable it came from, what was expected and what came.
+/// If the file cannot be read, a field is unknown or invalid, or a variable is misspelt. The error names the field, its file or
+/// variable, what was expected and what came.
 pub fn load<C>(prefix: &str, file: Option<&Path>, settings: &C, sources: &Sources) -> anyhow::Result<C>
 where
     C: Default + Serialize + DeserializeOwned,
@@ -125,6 +126,7 @@ where
 {
     let defaults = serde_json::to_value(C::default())?;
     let fields: Vec<_> = defaults.as_object().into_iter().flat_map(serde_json::Map::keys).map(String::as_str).collect();
+
     let mut figment = Figment::from(Serialized::defaults(C::default()));
     if let Some(file) = file {
         figment = figment.merge(Toml::file_exact(file));
@@ -135,16 +137,16 @@ where
     Ok(figment.merge(Serialized::defaults(given)).extract_lossy()?)
 }
 
-/// The environment, as far as it is text.
+/// Environment variables whose names and values are Unicode.
 pub fn environment() -> impl Iterator<Item = (String, String)> {
     std::env::vars_os().filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
 }
 
-/// The variables of the environment that set one of `fields`, or a part of it. Others of the prefix are passed over, with a
-/// line in the log: Kubernetes injects such names. `read` makes a value of a key and its text.
+/// Environment variables that set one of `fields` or a part of it, each parsed by `read` from its key and text. Others of the
+/// prefix are ignored with a warning, since Kubernetes injects such names.
 ///
 /// # Errors
-/// If a name is nearly that of a field.
+/// If a name looks like a misspelling of a field.
 pub fn variables(
     prefix: &str,
     fields: &[&str],
@@ -159,6 +161,7 @@ pub fn variables(
         }
         let key = key.to_lowercase().replace("__", ".");
         let field = key.split('.').next().unwrap_or_default();
+
         if fields.contains(&field) {
             variables.push(Variable { value: read(&key, &text), name, key });
             continue;
@@ -172,11 +175,11 @@ pub fn variables(
     Ok(variables)
 }
 
-/// A setting from the environment.
+/// Setting from the environment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Variable {
     name: String,
-    /// Field, or fields within each other, separated by dots.
+    /// Path of the field, separated by dots.
     key: String,
     value: Value,
 }
@@ -192,8 +195,8 @@ impl Provider for Variable {
     }
 }
 
-/// A value that is written as text: a list or table where it looks like one, and text otherwise, of which the field
-/// makes a number or truth where it is one.
+/// Parses the text of a variable: a list or table if it starts like one, else a string, which the field's type converts to a
+/// number or boolean.
 fn value(text: &str) -> Value {
     if text.starts_with(['[', '{']) { text.parse().unwrap_or_else(|never| match never {}) } else { Value::from(text) }
 }
@@ -232,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn the_field_decides_what_a_text_means() {
+    fn text_is_parsed_by_the_type_of_the_field() {
         let config = load(
             "",
             &[
@@ -253,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_empty_or_of_others_is_passed_over_and_what_is_misspelt_is_not() {
+    fn empty_and_unknown_variables_are_ignored_and_misspelt_ones_refused() {
         let injected = [
             ("CPN_TEST_NAME", ""),
             ("CPN_TEST_LISTEN", ""),

@@ -1,4 +1,4 @@
-//! Files that are there whole or not at all.
+//! Atomic writes, bounded reads, and locks of files and folders.
 
 use anyhow::{Context, bail};
 use std::ffi::OsStr;
@@ -7,28 +7,28 @@ use std::io::{Read, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-/// How the names of temporary files begin.
+/// Prefix of the names of temporary files.
 const UNFINISHED: &str = ".unfinished-";
-/// Name of the file in a folder that the process that keeps it has locked.
+/// Name of a folder's lock file.
 const LOCK: &str = ".lock";
-/// Most that is read of who has locked a file, in bytes.
-const MAX_KEEPER_BYTES: u64 = 1024;
-/// Folder of the file system's own, at the top of one.
+/// Longest description of a lock's holder, in bytes.
+const MAX_HOLDER_BYTES: u64 = 1024;
+/// Folder for recovered files at the root of a file system.
 const LOST_AND_FOUND: &str = "lost+found";
 
-/// Makes a folder, if there is none, and takes it over for as long as the answer lives: two processes would each know a
-/// part of what is in it.
+/// Creates a folder, if there is none, and locks it for as long as the returned file lives: with two writers, each would know
+/// only a part of its contents.
 ///
 /// # Errors
-/// If the folder cannot be made, or another process has it, which the error names.
+/// If the folder cannot be created, or another process holds the lock, which the error names.
 pub fn take_over(folder: &Path) -> anyhow::Result<File> {
     lock(folder, LOCK).with_context(|| folder.display().to_string())
 }
 
-/// The same for a single file, and whatever this process writes beside it: its folder may hold those of others.
+/// Locks a single file, and the files that this process writes beside it; other files of its folder stay free.
 ///
 /// # Errors
-/// If its folder cannot be made, or another process has the file, which the error names.
+/// If its folder cannot be created, or another process holds the lock, which the error names.
 pub fn take_over_file(path: &Path) -> anyhow::Result<File> {
     let take_over = || {
         let name = path.file_name().context("expected the path of a file")?;
@@ -37,57 +37,58 @@ pub fn take_over_file(path: &Path) -> anyhow::Result<File> {
     take_over().with_context(|| path.display().to_string())
 }
 
-/// Locks a file of a folder, which then says who has it.
+/// Locks the file `name` of a folder, and writes a description of this process into it.
 fn lock(folder: &Path, name: &str) -> anyhow::Result<File> {
     std::fs::create_dir_all(folder)?;
     let path = folder.join(name);
-    // What the other process wrote stays.
+    // Not truncated: the file has the description of the current holder.
     let mut lock = File::options().read(true).write(true).create(true).truncate(false).open(&path)?;
     if let Err(error) = lock.try_lock() {
         let std::fs::TryLockError::WouldBlock = error else { return Err(error.into()) };
-        let mut keeper = String::new();
-        // Who has it may not have written so yet.
-        let _ = lock.take(MAX_KEEPER_BYTES).read_to_string(&mut keeper);
-        let keeper = if keeper.is_empty() { "another process" } else { keeper.trim() };
-        bail!("expected one that no process keeps, got that of {keeper}");
+        let mut holder = String::new();
+        // The holder may not have written its description yet.
+        let _ = lock.take(MAX_HOLDER_BYTES).read_to_string(&mut holder);
+        let holder = if holder.is_empty() { "another process" } else { holder.trim() };
+        bail!("expected one that no process keeps, got that of {holder}");
     }
-    // That it can be named is a convenience.
-    let _ = lock.set_len(0).and_then(|()| lock.write_all(keeper().as_bytes()));
+
+    // The lock holds without the description, which only serves error messages.
+    let _ = lock.set_len(0).and_then(|()| lock.write_all(this_process().as_bytes()));
     Ok(lock)
 }
 
-/// This process, as people look for it.
-fn keeper() -> String {
+/// Description of this process, for people: number, program and host.
+fn this_process() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let program = std::env::args().next().unwrap_or_default();
     let program = Path::new(&program).file_name().unwrap_or_default().to_string_lossy();
     format!("process {} ({program}) on {}\n", std::process::id(), host.trim())
 }
 
-/// The paths in a folder, ordered by name. Those that belong to nobody are left out: names that begin with a dot, which
-/// systems, editors and unfinished writes leave behind, and `lost+found`.
+/// Paths in a folder, ordered by name, without `lost+found` and names that begin with a dot, which operating systems, editors
+/// and unfinished writes leave behind.
 ///
 /// # Errors
-/// If the folder is not there or cannot be read.
+/// If the folder does not exist or cannot be read.
 pub fn list(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let list = || {
         let paths = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
         std::io::Result::Ok(paths)
     };
     let mut paths = list().with_context(|| format!("folder {}", folder.display()))?;
-    paths.retain(|path| path.file_name().is_some_and(|name| !is_nobodys(name)));
+    paths.retain(|path| path.file_name().is_some_and(|name| !is_hidden(name)));
     paths.sort();
     Ok(paths)
 }
 
-fn is_nobodys(name: &OsStr) -> bool {
+fn is_hidden(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b".") || name == LOST_AND_FOUND
 }
 
-/// A regular file's bytes, from the beginning and so many at most.
+/// Reads the first `max_bytes` of a regular file, or all if there are fewer.
 ///
 /// # Errors
-/// If it cannot be read, or is no regular file: reading from one that is not may never end.
+/// If it cannot be read, or is no regular file: reading from a device or pipe may never end.
 pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     if !path.metadata()?.is_file() {
         return Err(std::io::Error::other("not a regular file"));
@@ -97,10 +98,10 @@ pub fn read_at_most(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// All bytes of a regular file.
+/// Reads a regular file of at most `max_bytes`.
 ///
 /// # Errors
-/// If it cannot be read, is no regular file, or has more than so many bytes.
+/// If it cannot be read, is no regular file, or is larger than `max_bytes`.
 pub fn read_all(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     let bytes = read_at_most(path, max_bytes + 1)?;
     if bytes.len() > max_bytes {
@@ -109,16 +110,18 @@ pub fn read_all(path: &Path, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The same of a file of this name in a folder: never of one elsewhere, to which a symbolic link leads.
+/// Reads the first `max_bytes` of the file `name` inside a folder; symbolic links that lead out of it are refused.
 ///
 /// # Errors
-/// If it cannot be read, is no regular file, or lies elsewhere.
+/// If it cannot be read, is no regular file, or is outside the folder.
 pub fn read_inside(folder: &Path, name: &str, max_bytes: usize) -> std::io::Result<Vec<u8>> {
     let other = std::io::Error::other;
     let path = folder.join(name).canonicalize()?;
     if !path.starts_with(folder.canonicalize()?) {
         return Err(other("a link to a file outside the folder"));
     }
+
+    // The opened file must be the checked one: it may be replaced in between.
     let found = path.symlink_metadata()?;
     if !found.is_file() {
         return Err(other("not a regular file"));
@@ -128,24 +131,24 @@ pub fn read_inside(folder: &Path, name: &str, max_bytes: usize) -> std::io::Resu
     if (found.dev(), found.ino()) != (opened.dev(), opened.ino()) {
         return Err(other("another file by now"));
     }
+
     let mut bytes = Vec::new();
     file.take(max_bytes as u64).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 
-/// Writes a file by way of a temporary one beside it, so that no reader ever sees a part. When this returns, the file
-/// outlasts a crash.
+/// Writes a file atomically, by way of a temporary one beside it. When this returns, the file is durable.
 ///
 /// # Errors
-/// If the folder cannot be made or written.
+/// If the folder cannot be created or written.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     write(path, bytes, 0o666)
 }
 
-/// The same for what nobody else may read.
+/// Writes a file atomically that only this user may read.
 ///
 /// # Errors
-/// If the folder cannot be made or written.
+/// If the folder cannot be created or written.
 pub fn write_secret(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     write(path, bytes, 0o600)
 }
@@ -157,7 +160,7 @@ fn write(path: &Path, bytes: &[u8], mode: u32) -> anyhow::Result<()> {
             std::fs::create_dir_all(folder)?;
             sync(folder.parent().unwrap_or(folder))?;
         }
-        // Temporary files are private by default; the umask decides what becomes of the mode.
+        // Temporary files are private by default; the umask applies to this mode.
         let permissions = Permissions::from_mode(mode);
         let mut file = tempfile::Builder::new().prefix(UNFINISHED).permissions(permissions).tempfile_in(folder)?;
         file.write_all(bytes)?;
@@ -168,13 +171,13 @@ fn write(path: &Path, bytes: &[u8], mode: u32) -> anyhow::Result<()> {
     write().with_context(|| format!("writing {}", path.display()))
 }
 
-/// Makes the names in a folder last.
+/// Makes the entries of a folder durable.
 fn sync(folder: &Path) -> anyhow::Result<()> {
-    // `.` stands for an empty path.
+    // An empty path is the current folder.
     Ok(File::open(Path::new(".").join(folder))?.sync_all()?)
 }
 
-/// Removes what killed processes left in a folder, which nobody else may be writing to.
+/// Removes the temporary files that killed processes left in a folder; no other process may be writing to it.
 ///
 /// # Errors
 /// If the folder cannot be read or written.
@@ -197,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_and_a_file_have_one_keeper_who_is_named() {
+    fn a_locked_folder_or_file_is_refused_with_its_holder() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("a/model.safetensors");
         for take_over in [|path: &Path| take_over(path), |path: &Path| take_over_file(path)] {
@@ -211,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_nobodys_is_not_listed_and_a_folder_that_is_not_there_is_an_error() {
+    fn hidden_names_are_not_listed_and_a_missing_folder_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["b", "._b", ".Trash-1000", "lost+found", "a.b", "c"] {
             std::fs::create_dir(folder.path().join(name)).unwrap();

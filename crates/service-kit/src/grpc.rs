@@ -1,4 +1,4 @@
-//! Serving gRPC, with health and reflection.
+//! gRPC server with health and reflection services.
 
 use crate::access::{Access, Peer, Refusal};
 use crate::listener::{Connection, ListenConfig, Listener};
@@ -18,40 +18,39 @@ use tonic::transport::Server;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
-/// Name of the zenoh network among what health is asked for.
+/// Health service name of the zenoh connection.
 const ZENOH: &str = "zenoh";
-/// Path of the health service, which orchestrators ask without credentials.
+/// Path of the health service, which orchestrators call without credentials.
 const HEALTH: &str = "/grpc.health.v1.Health/";
-/// Path of the reflection service, for every identity that is known.
+/// Path of the reflection service, for every known identity.
 const REFLECTION: &str = "/grpc.reflection.v1.ServerReflection/";
-/// Silence after which a client is asked for a sign of life, and time that it has to give one.
+/// HTTP/2 keepalive: interval of silence before a ping, and timeout of its answer.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(30), Duration::from_secs(10));
-/// Most connections at the same time.
+/// Maximum number of connections.
 pub const MAX_CONNECTIONS: usize = 256;
-/// Most streams of a connection at the same time.
+/// Maximum number of concurrent streams per connection.
 const MAX_STREAMS: u32 = 256;
 
-/// Who may call what: an identity, and the path of a method.
+/// Authorisation rule: whether an identity may call the method at a path.
 pub type Allows = fn(identity: &str, path: &str) -> bool;
 
-/// A gRPC server that runs.
+/// Running gRPC server.
 #[derive(Debug)]
 pub struct GrpcServer {
-    /// Where it listens.
+    /// Listening address.
     pub address: SocketAddr,
     health: HealthReporter,
-    /// What health is asked for: the whole server and its one service.
+    /// Names in the health service: the whole server, and its only service.
     names: [&'static str; 2],
     stop: CancellationToken,
     task: AbortOnDropHandle<Result<(), tonic::transport::Error>>,
-    /// Tells health of the zenoh network.
+    /// Task that reports the zenoh connection to the health service.
     network: Option<AbortOnDropHandle<()>>,
 }
 
 impl GrpcServer {
-    /// Listens and answers by the `routes` of the service of this name, which `descriptors`, an encoded
-    /// `FileDescriptorSet`, describe, those who have `access` and are allowed to by `allows`. Health says "not serving" until
-    /// [`GrpcServer::ready`].
+    /// Starts a server of the service `name` with its `routes`, for clients that pass `access` and `allows`. `descriptors` is
+    /// its encoded `FileDescriptorSet`, for reflection. Health is `NOT_SERVING` until [`GrpcServer::ready`].
     ///
     /// # Errors
     /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
@@ -64,12 +63,14 @@ impl GrpcServer {
     ) -> anyhow::Result<Self> {
         let listener = Listener::bind("gRPC", listen, &[b"h2"]).await?;
         let address = listener.address();
+
         let (health, health_service) = tonic_health::server::health_reporter();
         let reflection = tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(descriptors)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
             .build_v1()?;
         let routes = routes.add_service(health_service).add_service(reflection).into_axum_router();
+
         let check = move |request: Request, next: Next| {
             let checked = check(&access, allows, &request);
             async move {
@@ -80,6 +81,7 @@ impl GrpcServer {
             }
         };
         let routes = Routes::from(routes.layer(middleware::from_fn(check)));
+
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
         let server = Server::builder()
@@ -88,6 +90,7 @@ impl GrpcServer {
             .max_concurrent_streams(Some(MAX_STREAMS))
             .add_routes(routes)
             .serve_with_incoming_shutdown(incoming(listener), stopped);
+
         let names = ["", name];
         set_health(&health, names, ServingStatus::NotServing).await;
         health.set_service_status(ZENOH, ServingStatus::NotServing).await;
@@ -95,7 +98,7 @@ impl GrpcServer {
         Ok(Self { address, health, names, stop, task, network: None })
     }
 
-    /// Lets health tell, under the name `zenoh`, whether the zenoh network is joined.
+    /// Reports the zenoh connection to the health service, under the name `zenoh`.
     pub fn follow(&mut self, mut connected: watch::Receiver<bool>) {
         let health = self.health.clone();
         self.network = Some(AbortOnDropHandle::new(tokio::spawn(async move {
@@ -110,19 +113,19 @@ impl GrpcServer {
         })));
     }
 
-    /// Lets health say "serving".
+    /// Sets health to `SERVING`.
     pub async fn ready(&self) {
         set_health(&self.health, self.names, ServingStatus::Serving).await;
     }
 
-    /// Takes no more requests and waits for those in flight.
+    /// Stops accepting requests and waits for those in flight.
     ///
     /// # Errors
     /// If the server had failed.
     pub async fn drain(&mut self) -> anyhow::Result<()> {
         set_health(&self.health, self.names, ServingStatus::NotServing).await;
         self.network = None;
-        // Ends the streams that watch them, which would keep their connections open.
+        // Ends clients' watch streams, which would keep their connections open.
         for name in self.names.into_iter().chain([ZENOH]) {
             self.health.clear_service_status(name).await;
         }
@@ -143,7 +146,7 @@ fn incoming(listener: Listener) -> impl stream::Stream<Item = std::io::Result<Co
 
 fn check(access: &Access, allows: Allows, request: &Request) -> Result<(), Refusal> {
     let path = request.uri().path();
-    // Tonic lays the peer beside every request.
+    // Tonic adds the peer to the extensions of every request.
     let (false, Some(peer)) = (path.starts_with(HEALTH), request.extensions().get::<Peer>()) else {
         return Ok(());
     };

@@ -1,5 +1,5 @@
-//! What every service needs around its work: configuration, files, logs, metrics, output, shutdown, a zenoh session, and
-//! listeners with TLS and access control for gRPC and others.
+//! Infrastructure shared by all services: configuration, files, logs, metrics, output, shutdown, a zenoh session, and listeners
+//! with TLS and access control for gRPC and others.
 
 pub mod access;
 pub mod changes;

@@ -1,4 +1,4 @@
-//! Listening: bounded connections, with TLS beyond the loopback interface.
+//! TCP listener with a bounded number of connections, and TLS beyond the loopback interface.
 
 use crate::access::Peer;
 use crate::tls::{self, Tls};
@@ -20,28 +20,29 @@ use tokio_util::task::AbortOnDropHandle;
 use tonic::transport::server::Connected;
 use tracing::warn;
 
-/// Time that a client has for its TLS handshake.
+/// Timeout of a TLS handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time that a client has for its first byte, and then from one to the next: what is served here asks silent clients for a
-/// sign of life more often than that.
-const SILENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(60)];
-/// Pause after the system has refused a connection, as when file descriptors are used up.
-const PAUSE: Duration = Duration::from_millis(200);
+/// Timeout of a client's first byte.
+const FIRST_READ_TIMEOUT: Duration = Duration::from_secs(5);
+/// Timeout between two reads from a client: longer than the keepalive intervals of the services.
+const READ_TIMEOUT: Duration = Duration::from_secs(60);
+/// Pause after a failed accept, as when file descriptors are used up.
+const ACCEPT_RETRY: Duration = Duration::from_millis(200);
 
 /// Settings of a listener.
 #[derive(Debug, Clone)]
 pub struct ListenConfig {
-    /// Where to listen; port 0 takes a free one.
+    /// Listening address; port 0 takes a free one.
     pub address: SocketAddr,
-    /// Encryption, if any.
+    /// TLS files, if encrypted.
     pub tls: Option<Tls>,
-    /// Allows an address beyond the loopback interface without TLS.
+    /// Permission to listen beyond the loopback interface without TLS.
     pub insecure: bool,
-    /// Most connections at the same time; one more is closed at once.
+    /// Maximum number of connections; further ones are closed at once.
     pub max_connections: usize,
 }
 
-/// Whether an address or host, with or without a port, is of the loopback interface.
+/// Whether an address or host, with or without a port, is on the loopback interface.
 pub fn is_loopback(address: &str) -> bool {
     let address = address.split(['?', '#']).next().unwrap_or_default();
     if let Ok(address) = address.parse::<SocketAddr>() {
@@ -51,7 +52,7 @@ pub fn is_loopback(address: &str) -> bool {
     host == "localhost" || host.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
-/// Accepts connections.
+/// TCP listener whose connections are accepted, and encrypted, in the background.
 #[derive(Debug)]
 pub struct Listener {
     address: SocketAddr,
@@ -60,7 +61,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Listens, in the name of `name` in logs and errors; `protocols` are those of TLS's negotiation (ALPN).
+    /// Binds a listener, called `name` in logs, metrics and errors; `protocols` are the ALPN protocols.
     ///
     /// # Errors
     /// If the address cannot be listened on, or is beyond the loopback interface without TLS, or a TLS file cannot be used.
@@ -79,12 +80,12 @@ impl Listener {
         Ok(Self { address, connections, _task: task })
     }
 
-    /// Where it listens.
+    /// Listening address.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// The next connection, encrypted already if it is to be; none once the listener has ended.
+    /// Next connection, after its TLS handshake if there is TLS; none once the listener has ended.
     pub async fn next(&mut self) -> Option<Connection> {
         self.connections.recv().await
     }
@@ -104,23 +105,25 @@ async fn accept(
             Err(error) => {
                 count_refusal(name, "system");
                 warn!(listener = name, %error, "a connection was not accepted");
-                sleep(PAUSE).await;
+                sleep(ACCEPT_RETRY).await;
                 continue;
             }
         };
+
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
             count_refusal(name, "full");
             warn!(listener = name, client = %address, max_connections, "a connection was refused: all places are taken");
             continue;
         };
+
         let (acceptor, sender) = (acceptor.clone(), sender.clone());
         tokio::spawn(async move {
-            match shake_hands(stream, acceptor).await {
+            match handshake(stream, acceptor).await {
                 Ok((stream, certificate)) => {
                     let peer = Peer { address, certificate };
-                    let (patience, last_read) = (Box::pin(sleep(SILENCE[0])), None);
+                    let (read_timeout, last_read) = (Box::pin(sleep(FIRST_READ_TIMEOUT)), None);
                     // The listener may have ended.
-                    let _ = sender.send(Connection { stream, peer, patience, last_read, _place: place }).await;
+                    let _ = sender.send(Connection { stream, peer, read_timeout, last_read, _place: place }).await;
                 }
                 Err(error) => {
                     count_refusal(name, "handshake");
@@ -137,8 +140,8 @@ fn count_refusal(listener: &'static str, reason: &'static str) {
 
 type Stream = Either<TcpStream, Box<TlsStream<TcpStream>>>;
 
-/// Encrypts the stream, if it is to be; answers the common name of the client's certificate, too.
-async fn shake_hands(stream: TcpStream, acceptor: Option<TlsAcceptor>) -> std::io::Result<(Stream, Option<String>)> {
+/// TLS handshake, if there is an acceptor; returns the stream, and the common name of the client's certificate.
+async fn handshake(stream: TcpStream, acceptor: Option<TlsAcceptor>) -> std::io::Result<(Stream, Option<String>)> {
     stream.set_nodelay(true)?;
     let Some(acceptor) = acceptor else { return Ok((Either::Left(stream), None)) };
     let stream = timeout(HANDSHAKE_TIMEOUT, acceptor.accept(stream)).await??;
@@ -147,19 +150,18 @@ async fn shake_hands(stream: TcpStream, acceptor: Option<TlsAcceptor>) -> std::i
     Ok((Either::Right(Box::new(stream)), name))
 }
 
-/// A connection to a client, which ends in an error when the client says nothing for too long. Its place is free again
-/// when it is dropped.
+/// Connection to a client; reads fail when the client is silent beyond the timeout. Dropping it frees its place.
 #[derive(Debug)]
 pub struct Connection {
     stream: Stream,
     peer: Peer,
-    patience: Pin<Box<Sleep>>,
+    read_timeout: Pin<Box<Sleep>>,
     last_read: Option<Instant>,
     _place: OwnedSemaphorePermit,
 }
 
 impl Connection {
-    /// The other side.
+    /// Remote side.
     pub fn peer(&self) -> &Peer {
         &self.peer
     }
@@ -181,7 +183,7 @@ impl AsyncRead for Connection {
     ) -> Poll<std::io::Result<()>> {
         let before = to.filled().len();
         match Pin::new(&mut self.stream).poll_read(context, to) {
-            Poll::Pending => self.poll_silence(context),
+            Poll::Pending => self.poll_timeout(context),
             ready => {
                 if to.filled().len() > before {
                     self.last_read = Some(Instant::now());
@@ -193,12 +195,12 @@ impl AsyncRead for Connection {
 }
 
 impl Connection {
-    /// Pending until the client has been silent for too long.
-    fn poll_silence(&mut self, context: &mut Context<'_>) -> Poll<std::io::Result<()>> {
-        while self.patience.as_mut().poll(context).is_ready() {
-            let until = self.last_read.map(|last_read| last_read + SILENCE[1]);
+    /// Pending until the read timeout expires, then an error. The timer is reset lazily, not with every read.
+    fn poll_timeout(&mut self, context: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+        while self.read_timeout.as_mut().poll(context).is_ready() {
+            let until = self.last_read.map(|last_read| last_read + READ_TIMEOUT);
             match until.filter(|until| *until > Instant::now()) {
-                Some(until) => self.patience.as_mut().reset(until),
+                Some(until) => self.read_timeout.as_mut().reset(until),
                 None => return Poll::Ready(Err(std::io::ErrorKind::TimedOut.into())),
             }
         }

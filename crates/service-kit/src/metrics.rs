@@ -1,4 +1,4 @@
-//! Metrics for Prometheus.
+//! Prometheus metrics endpoint.
 
 use crate::access::{Access, Peer, Refusal};
 use crate::listener::{Connection, ListenConfig, Listener};
@@ -13,18 +13,18 @@ use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-/// Upper bounds of the buckets of durations, whose names end in `_seconds`: from a tenth of a millisecond to ten seconds.
+/// Histogram buckets of metrics in `_seconds`: upper bounds from 0.1 ms to 10 s.
 const SECONDS: [f64; 16] = [1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
-/// Those of counts, whose names end in `_size`.
+/// Histogram buckets of metrics in `_size`: upper bounds.
 const SIZES: [f64; 9] = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0];
 
-/// Interval between two clean-ups of what histograms hold.
+/// Interval of the recorder's upkeep, which drains the samples of histograms.
 const UPKEEP: Duration = Duration::from_secs(5);
-/// Most connections at the same time: a few scrapers.
+/// Maximum number of connections: a few scrapers.
 pub const MAX_CONNECTIONS: usize = 16;
 
-/// Answers scrapes at `http://<listen>/metrics`, or `https` with TLS, with everything this process counts from now on; once a
-/// process. Those are served who have `access` and whose identity `allows` it.
+/// Serves this process's metrics from now on at `http://<listen>/metrics`, or `https` with TLS, to clients that pass `access`
+/// and `allows`. Once per process.
 ///
 /// # Errors
 /// If the address cannot be listened on, or is beyond the loopback interface without TLS, or metrics are served already.
@@ -36,6 +36,7 @@ pub async fn serve(listen: ListenConfig, access: Access, allows: fn(identity: &s
         .set_buckets_for_metric(Matcher::Suffix("_size".into()), &SIZES)?
         .install_recorder()
         .with_context(|| format!("metrics on {address}"))?;
+
     let upkeep = recorder.clone();
     tokio::spawn(async move {
         loop {
@@ -43,6 +44,7 @@ pub async fn serve(listen: ListenConfig, access: Access, allows: fn(identity: &s
             upkeep.run_upkeep();
         }
     });
+
     let scrape = move |ConnectInfo(Scraper(peer)): ConnectInfo<Scraper>, headers: HeaderMap| async move {
         let authorization = headers.get(AUTHORIZATION).and_then(|value| value.to_str().ok());
         match access.check(&peer, authorization, "metrics", allows) {
@@ -51,12 +53,13 @@ pub async fn serve(listen: ListenConfig, access: Access, allows: fn(identity: &s
             Err(refusal) => (StatusCode::UNAUTHORIZED, refusal.to_string()),
         }
     };
+
     let app = Router::new().route("/metrics", get(scrape)).into_make_service_with_connect_info::<Scraper>();
     tokio::spawn(async move { axum::serve(listener, app).await });
     Ok(())
 }
 
-/// The other side of a scrape.
+/// Remote side of a scrape.
 #[derive(Debug, Clone)]
 struct Scraper(Peer);
 

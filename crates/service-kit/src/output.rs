@@ -4,10 +4,10 @@ use anyhow::anyhow;
 use std::fmt::Display;
 use std::io::{ErrorKind, Write};
 
-/// Writes a text to standard output. That nobody reads it any more is no error.
+/// Writes a text to standard output. A closed pipe is no error.
 ///
 /// # Errors
-/// If it cannot be written, with the name of the file.
+/// If standard output cannot be written, with the name of its file.
 pub fn print(text: impl Display) -> anyhow::Result<()> {
     let write = || {
         let mut out = std::io::stdout().lock();
@@ -17,7 +17,7 @@ pub fn print(text: impl Display) -> anyhow::Result<()> {
     accept(write())
 }
 
-/// The same, and the end of the line.
+/// Writes a text and a line break to standard output.
 ///
 /// # Errors
 /// As [`print`].
@@ -25,10 +25,10 @@ pub fn print_line(text: impl Display) -> anyhow::Result<()> {
     print(format_args!("{text}\n"))
 }
 
-/// What is to be told of a try to write to standard output: nothing if nobody reads it.
+/// Converts the result of a write to standard output: a closed pipe is no error.
 ///
 /// # Errors
-/// Why it cannot be written, with the name of the file.
+/// If the write failed otherwise, with the name of standard output's file.
 pub fn accept(written: std::io::Result<()>) -> anyhow::Result<()> {
     match written {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {

@@ -1,4 +1,4 @@
-//! Joining a zenoh network, and knowing whether one is joined.
+//! Zenoh session: configuration, opening, and monitoring of the connection.
 
 use crate::listener::{self, ListenConfig};
 use crate::process::ZENOH_RUNTIME;
@@ -18,19 +18,19 @@ use tracing::{info, warn};
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::{Session, Wait};
 
-/// Interval between two messages that nobody is connected.
+/// Interval of the warning that nothing is connected.
 const REMINDER: Duration = Duration::from_secs(5);
-/// Pause of a client before it tries its routers again.
+/// Pause of a client between two tries of its routers.
 const RETRY: Duration = Duration::from_secs(1);
-/// Interval between two looks at the connections.
-const LOOK: Duration = Duration::from_millis(500);
-/// Time in which the first connection is waited for, before a name is taken to be free.
+/// Interval of checks of connection and liveliness.
+const CHECK_INTERVAL: Duration = Duration::from_millis(500);
+/// Wait for the first connection before a name can count as free.
 const FIRST_CONNECTION: Duration = Duration::from_secs(1);
-/// Looks, one after the other, that find a name free before it is.
-const LOOKS: u32 = 2;
-/// Time that the liveliness token of a process that has died may linger: zenoh's lease, and some more.
+/// Consecutive checks without a token after which a name counts as free.
+const FREE_CHECKS: u32 = 2;
+/// Longest time for which a dead process's liveliness token lingers: zenoh's lease, with a margin.
 const LEASE: Duration = Duration::from_secs(15);
-/// Largest message that is put together from fragments: a request to load a model may carry its checkpoint.
+/// Largest message after defragmentation, in bytes: a request to load a model may carry its checkpoint.
 const MAX_MESSAGE_BYTES: usize = 66 << 20;
 
 /// Role of a session in its network.
@@ -42,12 +42,12 @@ pub enum Mode {
     Peer,
     /// One connection, to a router.
     Client,
-    /// Connections of others, between which it passes messages on.
+    /// Connections of other sessions, between which it routes messages.
     Router,
 }
 
-/// Connection to the zenoh network. Empty fields are not serialised, so that it can stand in a layer of configuration and on a
-/// command line alike.
+/// Connection to the zenoh network. Empty fields are not serialised, so that they leave lower layers of the configuration as
+/// they are.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct SessionConfig {
@@ -107,7 +107,7 @@ pub struct SessionConfig {
 }
 
 impl SessionConfig {
-    /// The TLS files, if any are given.
+    /// TLS files, if they are set.
     ///
     /// # Errors
     /// If only some of authority, certificate and private key are given.
@@ -134,7 +134,7 @@ impl SessionConfig {
         }
     }
 
-    /// What a listener at an address is told: the same TLS files as zenoh.
+    /// Settings of a listener at an address, with the same TLS files as zenoh.
     ///
     /// # Errors
     /// If only some of authority, certificate and private key are given.
@@ -153,6 +153,7 @@ impl SessionConfig {
             }
             None => defaults()?,
         };
+
         if let Some(mode) = self.mode {
             set(&mut zenoh, "mode", json!(mode))?;
         }
@@ -163,26 +164,29 @@ impl SessionConfig {
                 set(&mut zenoh, key, json!(endpoints))?;
             }
         }
+
         if self.shared_memory || self.zenoh_config.is_none() {
             set(&mut zenoh, "transport/shared_memory/enabled", json!(self.shared_memory))?;
         }
         if let Some(namespace) = &self.namespace {
             set(&mut zenoh, "namespace", json!(namespace))?;
         }
+
         if let (Some(user), Some(file)) = (&self.user, &self.password_file) {
             let password =
                 std::fs::read_to_string(file).with_context(|| format!("password_file {}", file.display()))?;
             set(&mut zenoh, "transport/auth/usrpwd/user", json!(user))?;
-            // The error of a refused value would print it.
+            // Zenoh's error of an invalid value would quote the password.
             zenoh
                 .insert_json5("transport/auth/usrpwd/password", &json!(password.trim_end_matches('\n')).to_string())
                 .map_err(|_| anyhow!("password_file {}: expected a password, got none", file.display()))?;
         }
+
         if let Some(tls) = self.tls()? {
             if std::env::var_os(ZENOH_RUNTIME).is_none() {
                 warn!("{ZENOH_RUNTIME} is not set: zenoh's TLS links are not safe on several threads");
             }
-            // Zenoh would tell of a faulty file only as of a router that does not answer.
+            // Checked here, since zenoh reports a faulty file only as a router that does not answer.
             tls.client()?;
             for (key, file) in [
                 ("root_ca_certificate", &tls.ca),
@@ -196,12 +200,13 @@ impl SessionConfig {
             set(&mut zenoh, "transport/link/tls/enable_mtls", json!(true))?;
             set(&mut zenoh, "transport/link/tls/close_link_on_expiration", json!(true))?;
         }
+
         self.check_endpoints(&zenoh)?;
         Ok(zenoh)
     }
 
-    /// Whether there is somebody to connect to: endpoints, or whoever is scouted.
-    fn seeks_others(&self) -> bool {
+    /// Whether a connection is expected: there are endpoints to connect to, or the mode is client.
+    fn expects_connection(&self) -> bool {
         let seeks = || {
             let zenoh = self.zenoh()?;
             let connect = endpoints(&zenoh, "connect/endpoints", &mode(&zenoh)?)?;
@@ -230,14 +235,14 @@ impl SessionConfig {
     }
 }
 
-/// Peers find each other by gossip from one known endpoint, never by multicast, which fails without a word in
-/// containers. An endpoint that is not up yet is tried again for as long as the session lives.
+/// Zenoh's configuration without settings. Peers find each other by gossip from one known endpoint, never by multicast, which
+/// fails silently in containers. An endpoint that is not up yet is retried for as long as the session lives.
 fn defaults() -> anyhow::Result<zenoh::Config> {
     let mut zenoh = zenoh::Config::default();
     set(&mut zenoh, "mode", json!("peer"))?;
     set(&mut zenoh, "scouting/multicast/enabled", json!(false))?;
     set(&mut zenoh, "scouting/gossip/enabled", json!(true))?;
-    // A client that waited by itself would try its first endpoint for ever, and no other.
+    // With a timeout of its own, a client would try its first endpoint for ever, and no other.
     set(&mut zenoh, "connect/timeout_ms", json!({"router": -1, "peer": -1, "client": 0}))?;
     set(&mut zenoh, "connect/exit_on_failure", json!(false))?;
     set(
@@ -264,7 +269,7 @@ fn mode(config: &zenoh::Config) -> anyhow::Result<String> {
     Ok(get(config, "mode")?.as_str().unwrap_or("peer").to_owned())
 }
 
-/// The endpoints of a mode: zenoh holds one list for all modes, or one for each.
+/// Endpoints of a mode: zenoh has one list for all modes, or one for each.
 fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Vec<String>> {
     fn collect(value: &Value, found: &mut Vec<String>) {
         match value {
@@ -273,6 +278,7 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
             _ => (),
         }
     }
+
     let value = get(config, key)?;
     let of_mode = value.get(mode).unwrap_or(&value);
     let mut found = Vec::new();
@@ -280,7 +286,7 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
     Ok(found)
 }
 
-/// Opens a session. A client waits for its router, and says so every few seconds.
+/// Opens a session. A client waits for its router, with a warning every few seconds.
 ///
 /// # Errors
 /// If a setting is malformed, a file cannot be read, an endpoint cannot be listened on, or listens beyond the loopback
@@ -288,19 +294,21 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
 pub async fn open(config: &SessionConfig) -> anyhow::Result<Session> {
     let zenoh = config.zenoh()?;
     let reached = endpoints(&zenoh, "connect/endpoints", &mode(&zenoh)?)?.join(", ");
-    let patient = mode(&zenoh)? == "client";
-    // Zenoh blocks while it connects, in a single poll: on a thread of its own, nobody else waits with it.
+    let is_client = mode(&zenoh)? == "client";
+
+    // On a thread of its own, since zenoh blocks in a single poll while it connects.
     let (sender, mut opened) = oneshot::channel();
     let open = move || {
         loop {
             let session = zenoh::open(zenoh.clone()).wait();
-            if session.is_ok() || !patient || sender.is_closed() {
+            if session.is_ok() || !is_client || sender.is_closed() {
                 return drop(sender.send(session));
             }
             std::thread::sleep(RETRY);
         }
     };
     std::thread::Builder::new().name("zenoh-open".into()).spawn(open)?;
+
     let mut reminder = interval(REMINDER);
     reminder.tick().await;
     loop {
@@ -317,7 +325,7 @@ pub async fn is_connected(session: &Session) -> bool {
     info.routers_zid().await.next().is_some() || info.peers_zid().await.next().is_some()
 }
 
-/// The connection of a session that has somebody to connect to.
+/// Monitor of a session's connection.
 #[derive(Debug)]
 pub struct Connection {
     connected: watch::Receiver<bool>,
@@ -325,19 +333,21 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// Follows a session: warns every few seconds while nobody is connected, and keeps the gauge `cpn_zenoh_connected`.
+    /// Monitors a session: warns every few seconds while nothing is connected, and sets the gauge `cpn_zenoh_connected`. A
+    /// session without anything to connect to counts as connected.
     pub fn follow(session: &Session, config: &SessionConfig) -> Self {
-        let (told, connected) = watch::channel(true);
-        let (session, alone) = (session.clone(), !config.seeks_others());
+        let (state, connected) = watch::channel(true);
+        let (session, standalone) = (session.clone(), !config.expects_connection());
         let task = AbortOnDropHandle::new(tokio::spawn(async move {
-            let mut look = interval(LOOK);
-            look.set_missed_tick_behavior(MissedTickBehavior::Skip);
+            let mut check = interval(CHECK_INTERVAL);
+            check.set_missed_tick_behavior(MissedTickBehavior::Skip);
             let mut reminded = None;
             while !session.is_closed() {
-                look.tick().await;
-                let connected = alone || is_connected(&session).await;
+                check.tick().await;
+                let connected = standalone || is_connected(&session).await;
                 gauge!("cpn_zenoh_connected").set(if connected { 1.0 } else { 0.0 });
-                let changed = told.send_if_modified(|told| std::mem::replace(told, connected) != connected);
+                let changed = state.send_if_modified(|state| std::mem::replace(state, connected) != connected);
+
                 if connected {
                     if changed {
                         info!("connected to the zenoh network again");
@@ -352,29 +362,30 @@ impl Connection {
         Self { connected, _task: task }
     }
 
-    /// Whether somebody is connected, and each change of it.
+    /// Whether a router or peer is connected, and each change of it.
     pub fn connected(&self) -> watch::Receiver<bool> {
         self.connected.clone()
     }
 }
 
-/// Waits until nobody holds a liveliness token: that of a process that was killed lingers for a while. Two processes that start
-/// in the same moment are not told apart.
+/// Waits until a liveliness token is free; that of a killed process lingers for a while. Two processes that start at the same
+/// moment can both succeed.
 ///
 /// # Errors
-/// If somebody holds it for longer than zenoh's lease: two services of one name would each get a part of the requests.
+/// If the token is held for longer than zenoh's lease: each of two services of one name would get a part of the requests.
 pub async fn claim(session: &Session, config: &SessionConfig, token: &OwnedKeyExpr) -> anyhow::Result<()> {
-    let (start, seeks) = (Instant::now(), config.seeks_others());
-    let (mut free, mut waiting) = (0, false);
+    let (start, expects_connection) = (Instant::now(), config.expects_connection());
+    let (mut free_checks, mut waiting) = (0, false);
     loop {
-        // Before a connection nobody can be seen; nor, for a moment, through a router that was just restarted.
-        let connected = !seeks || is_connected(session).await;
+        // Tokens are invisible before a connection and, for a moment, through a router that was just restarted.
+        let connected = !expects_connection || is_connected(session).await;
         let held = is_held(session, token).await?;
-        free = if held { 0 } else { free + 1 };
+        free_checks = if held { 0 } else { free_checks + 1 };
         let unseen = !connected && start.elapsed() < FIRST_CONNECTION;
-        if !seeks && !held || free >= LOOKS && !unseen {
+        if !expects_connection && !held || free_checks >= FREE_CHECKS && !unseen {
             return Ok(());
         }
+
         if held && !waiting {
             warn!(%token, "a service of this name is running or has just died; waiting for it to go");
             waiting = true;
@@ -383,7 +394,7 @@ pub async fn claim(session: &Session, config: &SessionConfig, token: &OwnedKeyEx
             start.elapsed() < LEASE || !held,
             "name: expected one that no running service has, got that of {token}"
         );
-        tokio::time::sleep(LOOK).await;
+        tokio::time::sleep(CHECK_INTERVAL).await;
     }
 }
 

@@ -14,23 +14,24 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer};
 
-/// Where spans are sent to, as OpenTelemetry names it; nothing is traced without.
+/// OpenTelemetry's environment variable with the endpoint for spans; tracing is off without it.
 const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
-/// Whose spans are traced.
+/// Targets whose spans are exported.
 const TRACED: [&str; 3] = ["planner", "evaluator", "wire"];
 
-/// Sends what is left when it is dropped.
+/// Guard of the span exporter; sends pending spans when dropped.
 #[derive(Debug)]
 pub struct Telemetry(Option<SdkTracerProvider>);
 
-/// Logs to standard error, at `info` unless `RUST_LOG` says otherwise. If `OTEL_EXPORTER_OTLP_ENDPOINT` is set, sends spans
-/// there by gRPC, in the name of `service`.
+/// Starts logging to standard error, at level `info` or as `RUST_LOG` sets it, and, if `OTEL_EXPORTER_OTLP_ENDPOINT` is set,
+/// the export of spans over gRPC under the service name `service`.
 ///
 /// # Errors
 /// If the endpoint is malformed.
 pub fn init(service: &'static str) -> anyhow::Result<Telemetry> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
     let logs = tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal());
+
     let provider =
         env::var_os(ENDPOINT).filter(|endpoint| !endpoint.is_empty()).map(|_| provider(service)).transpose()?;
     let traces = provider.as_ref().map(|provider| {
@@ -38,6 +39,7 @@ pub fn init(service: &'static str) -> anyhow::Result<Telemetry> {
         let targets = TRACED.map(|target| (target, tracing_subscriber::filter::LevelFilter::DEBUG));
         tracing_opentelemetry::layer().with_tracer(provider.tracer(service)).with_filter(Targets::from_iter(targets))
     });
+
     tracing_subscriber::registry().with(logs.with_filter(filter)).with(traces).init();
     Ok(Telemetry(provider))
 }

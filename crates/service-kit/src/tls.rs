@@ -1,4 +1,4 @@
-//! TLS for what is listened on and connected to: one authority for everybody, and a certificate for each.
+//! Mutual TLS: one certificate authority per network, one certificate per process.
 
 use anyhow::{Context, ensure};
 use metrics::gauge;
@@ -13,28 +13,28 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore, ServerConfig};
 use tracing::warn;
 use x509_parser::prelude::{FromDer, X509Certificate};
 
-/// Time before the end of a certificate from which on it is warned of.
+/// Remaining lifetime of a certificate below which a warning is logged.
 const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 
 /// PEM files of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tls {
-    /// Certificate authority of everybody.
+    /// Certificate of the network's authority.
     pub ca: PathBuf,
-    /// Certificate of this process, and those that lead to the authority.
+    /// Certificate chain of this process.
     pub certificate: PathBuf,
-    /// Its private key.
+    /// Private key of the certificate.
     pub private_key: PathBuf,
-    /// Certificates that the authority has revoked.
+    /// Certificate revocation list of the authority.
     pub crl: Option<PathBuf>,
 }
 
 impl Tls {
-    /// The configuration of a listener: clients may show a certificate, and one that is shown must be the authority's.
-    /// Keeps the gauge `cpn_certificate_expiry_timestamp_seconds`, and warns of a certificate that ends soon.
+    /// Server configuration with optional client certificates, which must be issued by the authority. Sets the gauge
+    /// `cpn_certificate_expiry_timestamp_seconds`, and warns of a certificate that expires soon.
     ///
     /// # Errors
-    /// Names the file that cannot be read or used.
+    /// If a file cannot be read or is invalid; the error names it.
     pub fn server(&self, protocols: &[&[u8]]) -> anyhow::Result<Arc<ServerConfig>> {
         let provider = Arc::new(ring::default_provider());
         let mut verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(self.roots()?), Arc::clone(&provider))
@@ -44,8 +44,9 @@ impl Tls {
             verifier = verifier.with_crls(lists);
         }
         let verifier = verifier.build().with_context(|| named("tls_crl", self.crl.as_deref().unwrap_or(&self.ca)))?;
+
         let certificates = self.certificates()?;
-        self.tell_expiry(&certificates)?;
+        self.report_expiry(&certificates)?;
         let mut config = ServerConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()?
             .with_client_cert_verifier(verifier)
@@ -55,10 +56,10 @@ impl Tls {
         Ok(Arc::new(config))
     }
 
-    /// The configuration of a client that shows its certificate.
+    /// Client configuration with a client certificate.
     ///
     /// # Errors
-    /// Names the file that cannot be read or used.
+    /// If a file cannot be read or is invalid; the error names it.
     pub fn client(&self) -> anyhow::Result<ClientConfig> {
         ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
             .with_safe_default_protocol_versions()?
@@ -83,7 +84,7 @@ impl Tls {
         PrivateKeyDer::from_pem_file(&self.private_key).with_context(|| named("tls_private_key", &self.private_key))
     }
 
-    fn tell_expiry(&self, certificates: &[CertificateDer<'_>]) -> anyhow::Result<()> {
+    fn report_expiry(&self, certificates: &[CertificateDer<'_>]) -> anyhow::Result<()> {
         for (name, certificate) in
             [("certificate", certificates.first()), ("ca", read_all("tls_ca", &self.ca)?.first())]
         {
@@ -102,7 +103,7 @@ impl Tls {
     }
 }
 
-/// Every item of a kind in a PEM file: one at least.
+/// All items of a kind in a PEM file, at least one.
 fn read_all<T: PemObject>(setting: &str, file: &Path) -> anyhow::Result<Vec<T>> {
     let items = T::pem_file_iter(file).and_then(Iterator::collect::<Result<Vec<T>, _>>);
     let items = items.with_context(|| named(setting, file))?;
@@ -114,7 +115,7 @@ fn named(setting: &str, file: &Path) -> String {
     format!("{setting} {}", file.display())
 }
 
-/// The common name in a certificate.
+/// Common name in a certificate.
 pub(crate) fn common_name(certificate: &CertificateDer<'_>) -> Option<String> {
     let (_, certificate) = X509Certificate::from_der(certificate).ok()?;
     let name = certificate.subject().iter_common_name().next()?.as_str().ok()?.to_owned();

@@ -1,5 +1,5 @@
-//! The direction of dependencies: services know the libraries; of these, only recordings know another, the messages. Within the
-//! method, files import each other in one direction, and the engine's storeys only those below.
+//! Direction of dependencies: services depend on libraries; of the libraries only `recording` depends on another, `wire`. Within
+//! `cpn`, files import each other without cycles, and the engine's levels only lower ones.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -9,7 +9,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-/// The names of the dependencies of each crate of the workspace, but for those of tests.
+/// Names of the dependencies of each workspace crate, without those of tests.
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--no-deps", "--offline", "--format-version", "1"])
@@ -26,7 +26,7 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 }
 
 #[test]
-fn each_crate_knows_only_what_it_may() {
+fn each_crate_depends_only_on_permitted_ones() {
     let allowed: BTreeMap<&str, &[&str]> = BTreeMap::from([
         ("cpn", &[][..]),
         ("cpn-torch", &["cpn"]),
@@ -53,7 +53,7 @@ fn each_crate_knows_only_what_it_may() {
 }
 
 #[test]
-fn the_method_knows_no_network_and_messages_no_tensors() {
+fn cpn_has_no_network_and_wire_no_tensors() {
     let dependencies = dependencies();
     let knows = |name: &str, others: &[&str]| others.iter().any(|other| dependencies[name].contains(*other));
     assert!(!knows("cpn", &["tch", "tokio", "zenoh", "tonic", "prost", "tracing"]));
@@ -64,13 +64,13 @@ fn the_method_knows_no_network_and_messages_no_tensors() {
     assert!(matches!(with_libtorch[..], [(name, _)] if name == "cpn-torch"), "{with_libtorch:?}");
 }
 
-/// Storeys of `crates/cpn/src/engine`, from the lowest.
+/// Dependency levels of `crates/cpn/src/engine`, from the lowest.
 const STOREYS: [&str; 6] = ["simd", "gemm", "layers", "networks", "planning", "training"];
 
-/// A module by the segments of its path, none for the crate itself.
+/// Module, as the segments of its path; empty for the crate itself.
 type Module = Vec<String>;
 
-/// Sources of a folder by module, without comments and the tests at a file's end.
+/// Sources of a folder by module, without comments and unit tests.
 fn sources(folder: &Path, module: &[String], modules: &mut BTreeMap<Module, String>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -87,7 +87,7 @@ fn sources(folder: &Path, module: &[String], modules: &mut BTreeMap<Module, Stri
     }
 }
 
-/// `a::{b, c::{d, self}}` as `a::b`, `a::c::d` and `a::c`.
+/// Expands `a::{b, c::{d, self}}` to `a::b`, `a::c::d` and `a::c`.
 fn expand(tree: &str) -> Vec<String> {
     let Some((prefix, group)) = tree.split_once('{') else { return vec![tree.trim().replace("::self", "")] };
     let group = group.trim_end().strip_suffix('}').unwrap();
@@ -120,7 +120,7 @@ fn paths(code: &str) -> Vec<String> {
     paths
 }
 
-/// The module that a path lies in, as seen from another; none if it is of another crate.
+/// Resolves a path, as seen from a module, to its module; none for other crates.
 fn resolve(path: &str, from: &Module, modules: &BTreeMap<Module, String>) -> Option<Module> {
     let mut segments: Vec<_> = path.split("::").map(|segment| segment.split(' ').next().unwrap().to_owned()).collect();
     let mut base = from.clone();
@@ -143,7 +143,7 @@ fn resolve(path: &str, from: &Module, modules: &BTreeMap<Module, String>) -> Opt
     Some(base)
 }
 
-/// The modules of `crates/cpn/src` that each of them imports.
+/// Imports between the modules of `crates/cpn/src`.
 fn imports() -> BTreeMap<Module, BTreeSet<Module>> {
     let mut modules = BTreeMap::new();
     sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../cpn/src"), &[], &mut modules);
@@ -155,11 +155,11 @@ fn imports() -> BTreeMap<Module, BTreeSet<Module>> {
 }
 
 #[test]
-fn no_file_of_the_method_imports_one_that_imports_it() {
+fn imports_within_cpn_have_no_cycles() {
     let mut left = imports();
     assert!(left[&vec!["checkpoint".to_owned()]].contains(&vec!["model".to_owned()]), "imports are found: {left:?}");
     loop {
-        // A file all of whose imports are known to lie below has its place.
+        // Topological order: a file is done once all of its imports are.
         let placed: Vec<_> = left.iter().filter(|(_, known)| known.is_empty()).map(|(file, _)| file.clone()).collect();
         if placed.is_empty() {
             break;
@@ -173,7 +173,7 @@ fn no_file_of_the_method_imports_one_that_imports_it() {
 }
 
 #[test]
-fn storeys_of_the_engine_use_only_those_below() {
+fn levels_of_the_engine_import_only_lower_ones() {
     let storey = |module: &Module| {
         let name = module.get(1).filter(|_| module[0] == "engine")?;
         Some(STOREYS.iter().position(|storey| storey == name).unwrap_or_else(|| panic!("no storey: {module:?}")))
@@ -191,7 +191,7 @@ fn storeys_of_the_engine_use_only_those_below() {
 }
 
 #[test]
-fn groups_of_imports_are_taken_apart() {
+fn groups_of_imports_are_expanded() {
     assert_eq!(expand("a::{b, c::{d, self}, e as f}"), ["a::b", "a::c::d", "a::c", "a::e as f"]);
     assert_eq!(paths("use a::{b};\nfn f() { crate::c::d(super::e) }"), ["a::b", "crate::c::d", "super::e"]);
 }

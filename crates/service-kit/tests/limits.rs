@@ -1,4 +1,4 @@
-//! `docs/limits.md` against the code: every row cites its source as it stands, and no bound of messages and services is left out.
+//! `docs/limits.md` against the code: every row cites its source verbatim, and no bound of messages and services is missing.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -6,20 +6,20 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
-/// Folders whose `MAX_` constants must stand on the page.
+/// Folders whose `MAX_` constants must all be listed.
 const BOUNDED: [&str; 5] =
     ["crates/wire/src", "services/certs/src", "services/evaluator/src", "services/planner/src", "services/trainer/src"];
-/// Cells of a row: bound, value, set by, effect, source.
+/// Number of cells of a row: bound, value, set by, effect, source.
 const COLUMNS: usize = 5;
 
-/// A place in the code: a file, and `NAME = initialiser` of a constant or another text in it.
+/// Citation of the code: a file, and `NAME = initialiser` of a constant or other text in it.
 type Citation = (String, String);
 
 fn read(file: &str) -> String {
     std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap_or_else(|e| panic!("{file}: {e}"))
 }
 
-/// The rows of every table, without its head.
+/// Rows of all tables, without heads.
 fn rows(page: &str) -> Vec<&str> {
     let lines: Vec<_> = page.lines().collect();
     let is_rule = |line: &str| line.starts_with("|-");
@@ -28,7 +28,7 @@ fn rows(page: &str) -> Vec<&str> {
     rows.map(|(line, _)| *line).collect()
 }
 
-/// The citations in the last cell of a row: files in backticks, each followed by texts in backticks.
+/// Citations in the last cell of a row: files in backticks, each followed by texts in backticks.
 fn citations(row: &str) -> Vec<Citation> {
     let cells: Vec<_> = row.trim_matches('|').split('|').collect();
     assert_eq!(cells.len(), COLUMNS, "expected {COLUMNS} cells: {row}");
@@ -45,7 +45,7 @@ fn citations(row: &str) -> Vec<Citation> {
     citations
 }
 
-/// `NAME = initialiser` of a constant of Rust that is declared in a line.
+/// `NAME = initialiser` of the Rust constant declared in a line.
 fn declared(line: &str) -> Option<String> {
     let (before, declaration) = line.trim().split_once("const ")?;
     let is_constant = before.is_empty() || before.starts_with("pub");
@@ -54,8 +54,7 @@ fn declared(line: &str) -> Option<String> {
     is_constant.then(|| format!("{name} = {initialiser}"))
 }
 
-/// Whether a file has what is cited: a constant with this very initialiser, or a text,
-/// in which any blanks are one.
+/// Whether a file has the citation: a constant with this initialiser, or the text, with runs of blanks collapsed.
 fn is_there((file, text): &Citation) -> bool {
     let source = read(file);
     let constant = |c: char| c.is_ascii_uppercase() || c.is_ascii_digit() || c == '_';
@@ -68,7 +67,7 @@ fn is_there((file, text): &Citation) -> bool {
     }
 }
 
-/// The files of Rust below a folder.
+/// Rust files below a folder.
 fn sources(folder: &Path) -> Vec<PathBuf> {
     let paths = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     paths.flat_map(|path| if path.is_dir() { sources(&path) } else { vec![path] }).collect()

@@ -1,4 +1,4 @@
-//! A listener against clients that say nothing, come in crowds, or come when the system has no more file descriptors.
+//! Listener against silent clients, too many clients, and a lack of file descriptors.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -21,9 +21,9 @@ async fn listener(max_connections: usize) -> Listener {
     Listener::bind("test", config, &[]).await.unwrap()
 }
 
-/// One test, since file descriptors and metrics are the process's.
+/// A single test, since file descriptors and metrics are per process.
 #[tokio::test(flavor = "multi_thread")]
-async fn silent_clients_crowds_and_a_lack_of_file_descriptors_pass() {
+async fn the_listener_survives_silent_clients_crowds_and_a_lack_of_file_descriptors() {
     let metrics = PrometheusBuilder::new().install_recorder().unwrap();
     let counted = |reason: &str| {
         let counter = format!("cpn_connections_refused_total{{listener=\"test\",reason=\"{reason}\"}}");
@@ -37,12 +37,12 @@ async fn silent_clients_crowds_and_a_lack_of_file_descriptors_pass() {
     if first.peer().address != silent.local_addr().unwrap() {
         std::mem::swap(&mut first, &mut second);
     }
-    // All places are taken.
+    // No place is left.
     let mut third = TcpStream::connect(listener.address()).await.unwrap();
     assert_eq!(soon(third.read(&mut [0])).await.unwrap_or(0), 0);
     assert!(counted("full"));
 
-    // The silent one is given up, and its place is free again; the other, which spoke, stays.
+    // The silent client is disconnected, which frees its place; the other, which sent a byte, stays.
     talking.write_all(b"a").await.unwrap();
     assert_eq!(soon(second.read_u8()).await.unwrap(), b'a');
     assert_eq!(soon(first.read_u8()).await.unwrap_err().kind(), std::io::ErrorKind::TimedOut);
@@ -54,7 +54,7 @@ async fn silent_clients_crowds_and_a_lack_of_file_descriptors_pass() {
     assert_eq!(soon(second.read_u8()).await.unwrap(), b'b');
     drop((second, fourth));
 
-    // Without file descriptors nobody is accepted, and the client waits; with some, it is served.
+    // Without file descriptors no connection is accepted, and the client waits; with some, it is served.
     let client = TcpSocket::new_v4().unwrap();
     rustix::process::setrlimit(rustix::process::Resource::Nofile, limit(200)).unwrap();
     let mut files = Vec::new();

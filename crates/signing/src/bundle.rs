@@ -1,4 +1,4 @@
-//! The format: a Sigstore bundle around a DSSE envelope around an in-toto statement about one file.
+//! Bundle format: a Sigstore bundle around a DSSE envelope around an in-toto statement about one file.
 
 use crate::Error;
 use base64::Engine as _;
@@ -7,31 +7,31 @@ use serde::Deserialize;
 use serde::de::{DeserializeOwned, IgnoredAny};
 use sha2::{Digest as _, Sha256};
 
-/// Largest bundle.
+/// Largest bundle, in bytes.
 pub const MAX_BYTES: usize = 65_536;
 
 const MEDIA_TYPE: &str = "application/vnd.dev.sigstore.bundle.v0.3+json";
 const PAYLOAD_TYPE: &str = "application/vnd.in-toto+json";
 const STATEMENT_TYPE: &str = "https://in-toto.io/Statement/v1";
 const PREDICATE_TYPE: &str = "https://model_signing/signature/v1.0";
-/// Serialisation of a model: every file is hashed whole.
+/// Serialisation method of a model: one hash per file.
 const METHOD: &str = "files";
 const HASH: &str = "sha256";
-/// What the official tool calls the one file of a model that is no folder; the specification has it called by its name.
+/// Name that the official tool gives to the only file of a single-file model, where the specification has the file's own.
 const ONLY_FILE: &str = ".";
 
-/// A bundle whose envelope is well-formed. Nothing is verified yet: see [`crate::TrustedKeys::verify`].
+/// Well-formed but unverified bundle; see [`crate::TrustedKeys::verify`].
 #[derive(Debug)]
 pub struct Bundle {
-    /// JSON of the statement.
+    /// Statement, in JSON.
     payload: Vec<u8>,
-    /// ECDSA over [`Self::signed_bytes`], in DER.
+    /// ECDSA signature of [`Self::signed_bytes`], in DER.
     pub(crate) signature: Vec<u8>,
-    /// What the signer says of the key.
+    /// Key identifier claimed by the signer.
     pub(crate) key_hint: Option<String>,
 }
 
-/// What a statement says of its one file.
+/// File that a statement is about.
 #[derive(Debug, PartialEq, Eq)]
 struct Resource {
     name: String,
@@ -40,16 +40,17 @@ struct Resource {
 }
 
 impl Bundle {
-    /// Reads a bundle of the key method with its one signature.
+    /// Parses a bundle of the public-key method with a single signature.
     ///
     /// # Errors
-    /// If there are more than [`MAX_BYTES`], or they are not such a bundle.
+    /// If the bundle is larger than [`MAX_BYTES`], or malformed.
     pub fn parse(json: &[u8]) -> Result<Self, Error> {
         if json.len() > MAX_BYTES {
             return Err(Error::malformed(format!("at most {MAX_BYTES} bytes"), format!("{} bytes", json.len())));
         }
         let format::Bundle { media_type, verification_material: material, dsse_envelope: envelope } =
             read(json, "a bundle in JSON")?;
+
         equal("mediaType", MEDIA_TYPE, &media_type)?;
         let key = match (material.public_key, material.x509_certificate_chain.or(material.certificate)) {
             (Some(key), None) => key,
@@ -58,11 +59,13 @@ impl Bundle {
             }
             (None, None) => return Err(Error::malformed("a publicKey as verificationMaterial", "none")),
         };
+
         equal("payloadType", PAYLOAD_TYPE, &envelope.payload_type)?;
-        // Sigstore has verifiers refuse any other number.
+        // Sigstore requires verifiers to refuse any other number.
         let [signature] = &envelope.signatures[..] else {
             return Err(Error::malformed("one signature", envelope.signatures.len()));
         };
+
         Ok(Self {
             payload: decode("payload", &envelope.payload)?,
             signature: decode("sig", &signature.sig)?,
@@ -70,24 +73,24 @@ impl Bundle {
         })
     }
 
-    /// Digest of the file that is signed, in lower-case hex, as the bundle has it: whoever made the bundle may say anything.
+    /// SHA-256 of the signed file, in lower-case hex, as claimed by the unverified bundle.
     ///
     /// # Errors
-    /// If the statement is not one about a single file.
+    /// If the statement is malformed, or not about a single file.
     pub fn claimed_digest(&self) -> Result<String, Error> {
         Ok(self.resource()?.digest)
     }
 
-    /// What the key signs: DSSE's pre-authentication encoding of the payload.
+    /// Signed bytes: DSSE's pre-authentication encoding of the payload.
     pub(crate) fn signed_bytes(&self) -> Vec<u8> {
         let head = format!("DSSEv1 {} {PAYLOAD_TYPE} {} ", PAYLOAD_TYPE.len(), self.payload.len());
         [head.as_bytes(), &self.payload].concat()
     }
 
-    /// Checks that the statement is about this file. Its name matters only where the signer wrote one for it.
+    /// Checks that the statement is about this file. The name is compared only if the statement has one.
     ///
     /// # Errors
-    /// If it is about another file or digest, or is no statement about a single file.
+    /// If the statement is about another file or digest, is malformed, or is not about a single file.
     pub(crate) fn check_file(&self, name: &str, digest: &str) -> Result<(), Error> {
         let resource = self.resource()?;
         let mismatch = |expected, got| Err(Error::new(crate::Fault::Mismatch, expected, got));
@@ -100,9 +103,9 @@ impl Bundle {
         Ok(())
     }
 
-    /// The one file of the statement.
+    /// Single file of the statement.
     fn resource(&self) -> Result<Resource, Error> {
-        // First what tells whether the rest has the expected shape.
+        // The types come first: the shape of the rest depends on them.
         let types: format::Types = read(&self.payload, "a statement in JSON")?;
         equal("_type", STATEMENT_TYPE, &types.statement)?;
         equal("predicateType", PREDICATE_TYPE, &types.predicate)?;
@@ -111,6 +114,7 @@ impl Bundle {
         let [subject] = &subject[..] else {
             return Err(Error::malformed("one subject", subject.len()));
         };
+
         let format::Predicate { serialization, resources } = predicate;
         equal("serialization.method", METHOD, &serialization.method)?;
         equal("serialization.hash_type", HASH, &serialization.hash_type)?;
@@ -120,7 +124,7 @@ impl Bundle {
         equal("algorithm", HASH, &resource.algorithm)?;
         let bytes = sha256("resources.digest", &resource.digest)?;
 
-        // The digest of the digests of all files, which are one.
+        // The root digest is that of the concatenated digests of all files, here a single one.
         let root = Sha256::digest(bytes);
         if sha256("subject.digest", &subject.digest.sha256)? != root[..] {
             return Err(Error::malformed(
@@ -137,7 +141,7 @@ pub fn digest(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// JSON in which no known field stands twice.
+/// Deserialises JSON; a duplicate of a known field is an error.
 fn read<T: DeserializeOwned>(json: &[u8], expected: &str) -> Result<T, Error> {
     serde_json::from_slice(json).map_err(|error| Error::malformed(expected, error))
 }
@@ -157,8 +161,8 @@ fn equal(field: &str, expected: &str, got: &str) -> Result<(), Error> {
     if got == expected { Ok(()) } else { Err(Error::malformed(format!("{field} {expected}"), format!("{got:?}"))) }
 }
 
-/// The JSON of bundles and statements. A field that stands twice is refused by the derived code; fields of the envelope that
-/// are unknown are refused too, those of the statement are passed over, as the specification wants it.
+/// JSON of bundles and statements. The derived code refuses duplicate fields. Unknown fields are refused in the envelope and
+/// ignored in the statement, as the specification requires.
 mod format {
     use super::{Deserialize, IgnoredAny};
 

@@ -1,32 +1,32 @@
-//! Reasons why a checkpoint is not what a trusted key signed.
+//! Errors of signature verification.
 
 use std::fmt;
 
-/// Longest text of a bundle in an error, in bytes.
+/// Longest quotation of a bundle in an error, in bytes.
 const MAX_TEXT_BYTES: usize = 200;
 
-/// A checkpoint without a good signature.
+/// Missing or invalid signature of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("signature: expected {expected}, got {got}")]
 pub struct Error {
     /// Kind of fault.
     pub fault: Fault,
-    /// What would have been right.
+    /// Description of a valid value.
     pub expected: String,
-    /// What came.
+    /// The value that came.
     pub got: String,
 }
 
 /// Kinds of faults of a signature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
-    /// There is no bundle.
+    /// No bundle.
     Unsigned,
-    /// The bundle is not one of this format.
+    /// Bundle of another format, or damaged.
     Malformed,
-    /// No trusted key made the signature.
+    /// Signature by no trusted key.
     Untrusted,
-    /// A trusted key signed something else.
+    /// Signature of another file by a trusted key.
     Mismatch,
 }
 
@@ -49,7 +49,7 @@ impl fmt::Display for Fault {
 }
 
 impl Error {
-    /// An error; a text that is too long is cut.
+    /// Error with overlong texts truncated.
     pub(crate) fn new(fault: Fault, expected: impl ToString, got: impl ToString) -> Self {
         let cut = |mut text: String| {
             if text.len() > MAX_TEXT_BYTES {

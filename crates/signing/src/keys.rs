@@ -1,4 +1,4 @@
-//! Public keys whose signatures count.
+//! Trusted public keys, and verification against them.
 
 use crate::{Bundle, Error, Fault, bundle};
 use p256::ecdsa::signature::Verifier as _;
@@ -6,17 +6,17 @@ use p256::pkcs8::{DecodePublicKey as _, EncodePublicKey as _, LineEnding};
 
 const BEGIN: &str = "-----BEGIN PUBLIC KEY-----";
 const END: &str = "-----END PUBLIC KEY-----";
-/// Largest file of public keys.
+/// Largest file of public keys, in bytes.
 const MAX_PEM_BYTES: usize = 65_536;
 
-/// Public keys whose signatures count.
+/// Set of trusted public keys.
 #[derive(Debug, Clone, Default)]
 pub struct TrustedKeys(Vec<TrustedKey>);
 
 #[derive(Debug, Clone)]
 struct TrustedKey {
     key: Key,
-    /// SHA-256 of the key's PEM, in hex: what the official tool puts into a bundle as a hint.
+    /// SHA-256 of the key's PEM, in hex: the hint that the official tool puts into a bundle.
     id: String,
 }
 
@@ -26,7 +26,7 @@ enum Key {
     P384(p384::ecdsa::VerifyingKey),
 }
 
-/// A file that is not one of public keys.
+/// Invalid file of public keys.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("public key: expected {expected}, got {got}")]
 pub struct KeyError {
@@ -35,16 +35,16 @@ pub struct KeyError {
 }
 
 impl TrustedKeys {
-    /// Reads one key or more, on the curve P-256 or P-384.
+    /// Parses one or more ECDSA keys on P-256 or P-384, in PEM.
     ///
     /// # Errors
-    /// If there is none, or one cannot be read.
+    /// If the text is larger than 64 KiB, has no key, or a malformed one.
     pub fn from_pem(text: &str) -> Result<Self, KeyError> {
         let error = |got: String| KeyError { expected: "ECDSA keys on P-256 or P-384, in PEM", got };
         if text.len() > MAX_PEM_BYTES {
             return Err(error(format!("{} bytes", text.len())));
         }
-        // Around the keys there may be text.
+        // PEM allows text around the keys.
         let (_, blocks) = text.split_once(BEGIN).ok_or_else(|| error("none".into()))?;
         let keys = blocks.split(BEGIN).enumerate().map(|(index, block)| {
             let end = block.find(END).map_or(block.len(), |start| start + END.len());
@@ -54,12 +54,12 @@ impl TrustedKeys {
         Ok(Self(keys.collect::<Result<_, _>>()?))
     }
 
-    /// Adds keys to these.
+    /// Adds the keys of another set.
     pub fn extend(&mut self, others: Self) {
         self.0.extend(others.0);
     }
 
-    /// Whether there is no key.
+    /// Whether the set is empty.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -69,15 +69,15 @@ impl TrustedKeys {
         self.0.iter().map(|key| key.id.as_str())
     }
 
-    /// Checks that one of these keys signed a file of these bytes; answers the key's identifier.
+    /// Verifies that one of the keys signed a file of these bytes, and returns the key's identifier.
     ///
     /// # Errors
-    /// If there is no bundle, it is malformed, no key here made its signature, or it is that of another file.
+    /// If there is no bundle, it is malformed, its signature is by none of the keys, or it is about another file.
     pub fn verify(&self, bundle: Option<&[u8]>, file_name: &str, bytes: &[u8]) -> Result<&str, Error> {
         self.verify_digest(bundle, file_name, &bundle::digest(bytes))
     }
 
-    /// The same for a file of this SHA-256, in lower-case hex.
+    /// [`Self::verify`] for a file given by its SHA-256, in lower-case hex.
     ///
     /// # Errors
     /// As [`Self::verify`].
@@ -85,9 +85,9 @@ impl TrustedKeys {
         let bundle = bundle.ok_or_else(|| Error::new(Fault::Unsigned, format!("a bundle for {file_name}"), "none"))?;
         let bundle = Bundle::parse(bundle)?;
 
-        // The hint is the signer's word only: it chooses no key.
+        // The hint is unverified, so that every key is tried.
         let signed = bundle.signed_bytes();
-        let signer = self.0.iter().find(|trusted| trusted.key.made(&bundle.signature, &signed));
+        let signer = self.0.iter().find(|trusted| trusted.key.verifies(&bundle.signature, &signed));
         let Some(signer) = signer else {
             let hinted = self.0.iter().find(|trusted| Some(&trusted.id) == bundle.key_hint.as_ref());
             let got = match (hinted, &bundle.key_hint) {
@@ -98,6 +98,7 @@ impl TrustedKeys {
             let ids: Vec<_> = self.ids().collect();
             return Err(Error::new(Fault::Untrusted, format!("one by key {}", ids.join(" or ")), got));
         };
+
         bundle.check_file(file_name, digest)?;
         Ok(&signer.id)
     }
@@ -117,8 +118,8 @@ impl TrustedKey {
 }
 
 impl Key {
-    /// Whether a signature, in DER, is this key's of these bytes.
-    fn made(&self, signature: &[u8], signed: &[u8]) -> bool {
+    /// Whether a signature, in DER, is valid for these bytes and this key.
+    fn verifies(&self, signature: &[u8], signed: &[u8]) -> bool {
         match self {
             Self::P256(key) => p256::ecdsa::Signature::from_der(signature).and_then(|s| key.verify(signed, &s)).is_ok(),
             Self::P384(key) => p384::ecdsa::Signature::from_der(signature).and_then(|s| key.verify(signed, &s)).is_ok(),

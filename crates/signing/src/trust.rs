@@ -1,15 +1,15 @@
-//! Policies towards checkpoints without a good signature.
+//! Policies towards checkpoints without a valid signature.
 
 use serde::{Deserialize, Serialize};
 
-/// Policy towards checkpoints without a good signature.
+/// Policy towards checkpoints without a valid signature by a trusted key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Trust {
-    /// Signatures are not looked at.
+    /// Signatures are not checked.
     Off,
-    /// Such a checkpoint is served, with a warning.
+    /// Unverified checkpoints are served, with a warning.
     Warn,
-    /// Such a checkpoint is refused.
+    /// Unverified checkpoints are refused.
     Enforce,
 }

@@ -1,4 +1,4 @@
-//! Bundles of others' tools, and bundles that are wrong in one thing each.
+//! Verification of bundles by other tools, and of bundles with one fault each.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -36,7 +36,7 @@ fn trusted(seeds: &[u8]) -> TrustedKeys {
     TrustedKeys::from_pem(&seeds.iter().map(|seed| pem(*seed)).collect::<String>()).unwrap()
 }
 
-/// What the official tool says of the checkpoint.
+/// Statement about the checkpoint, as the official tool writes it.
 fn statement() -> Value {
     json!({
         "_type": "https://in-toto.io/Statement/v1",
@@ -67,7 +67,7 @@ fn bundle_of(payload: &[u8], signatures: Value) -> Value {
     })
 }
 
-/// A bundle by key 1 around a payload.
+/// Bundle around a payload, signed with key 1.
 fn signed(payload: &[u8]) -> Value {
     bundle_of(payload, json!([signature(1, payload)]))
 }
@@ -80,7 +80,7 @@ fn verify(bundle: &[u8]) -> Result<(), Error> {
     trusted(&[1]).verify(Some(bundle), FILE, CHECKPOINT).map(drop)
 }
 
-/// The bundle is refused; the message contains each of `texts`.
+/// Asserts that the bundle is refused, with a message that contains each of `texts`.
 fn refused(bundle: &[u8], fault: Fault, texts: &[&str]) {
     let error = verify(bundle).unwrap_err();
     for text in texts {
@@ -112,7 +112,7 @@ fn the_official_tool_agrees() {
     assert_eq!(keys.verify(Some(&file), name, &weights).unwrap(), id);
     assert_eq!(keys.verify(Some(&folder), name, &weights).unwrap(), id);
 
-    // The signer of a folder wrote the file's name.
+    // The statement about a folder has the file's name.
     let error = keys.verify(Some(&folder), "other.safetensors", &weights).unwrap_err();
     let expected = r#"signature: expected one of the file "other.safetensors", got "weights.safetensors""#;
     assert_eq!((error.fault, error.to_string().as_str()), (Fault::Mismatch, expected));
@@ -124,9 +124,9 @@ fn the_official_tool_agrees() {
     assert_eq!(trusted(&[1]).verify(Some(&file), name, &weights).unwrap_err().fault, Fault::Untrusted);
 }
 
-/// Older releases of the official tool, whose hint is the whole key, and another curve.
+/// Bundles of older releases of the official tool, whose hint is the whole key, and of another curve.
 #[test]
-fn older_releases_are_understood() {
+fn bundles_of_older_releases_are_verified() {
     let keys = keys("model-transparency/public-key.pem");
     let model = fixture("model-transparency/signme-1");
     for release in ["v0.3.1", "v1.0.0"] {
@@ -135,14 +135,14 @@ fn older_releases_are_understood() {
         assert_eq!(keys.verify(Some(&bundle), "signme-1", b"signme-2\n").unwrap_err().fault, Fault::Mismatch);
         assert_eq!(trusted(&[1]).verify(Some(&bundle), "signme-1", &model).unwrap_err().fault, Fault::Untrusted);
     }
-    // Signed by a trusted key, and about a folder of two files.
+    // Signed by a trusted key, but about a folder of two files.
     let error = keys.verify(Some(&fixture("model-transparency/v1.1.0.sig")), "signme-1", &model).unwrap_err();
     assert_eq!(error.to_string(), "signature: expected one file among the resources, got 2");
 }
 
-/// The specification's vectors: those it calls invalid, and of the valid ones those of other methods, are malformed here.
+/// Test vectors of the specification: invalid ones, and valid ones of other methods, are malformed here.
 #[test]
-fn vectors_of_the_specification_are_told_apart() {
+fn vectors_of_the_specification_are_malformed() {
     let keys = keys("model-transparency/public-key.pem");
     let error = |vector: &str| {
         let bundle = fixture(&format!("specification/{vector}.bundle.json"));
@@ -159,10 +159,10 @@ fn vectors_of_the_specification_are_told_apart() {
         let error = error(vector);
         assert!(error.fault == Fault::Malformed && error.to_string().contains(text), "{vector}: {error:?}");
     }
-    // Signed by this very key, and about a folder of two files.
+    // Signed by the same key, but about a folder of two files.
     let folder = error("valid/key");
     assert_eq!(folder.to_string(), "signature: expected one file among the resources, got 2");
-    // The same signature around another statement.
+    // The same signature with another statement.
     assert_eq!(error("invalid-payload/wrong-predicate").fault, Fault::Untrusted);
 }
 
@@ -181,7 +181,7 @@ fn another_key_is_untrusted() {
         assert_eq!(error.fault, Fault::Untrusted);
         assert!(error.got.contains(&digest(pem(1).as_bytes())), "the hint is told: {error}");
     }
-    // Whatever the hint says: a stranger may write the trusted key's.
+    // Regardless of the hint, which may name the trusted key.
     let payload = statement().to_string();
     let forged = bundle_of(payload.as_bytes(), json!([signature(2, payload.as_bytes())]));
     refused(forged.to_string().as_bytes(), Fault::Untrusted, &["and does not verify"]);
@@ -199,7 +199,7 @@ fn a_changed_byte_is_noticed() {
         assert_eq!(error.fault, Fault::Mismatch);
         assert!(error.expected.ends_with(&digest(&changed)) && error.got == digest(CHECKPOINT), "{error}");
     }
-    // The statement of other weights below the signature of these.
+    // The statement of other weights with the signature of these.
     let other = statement().to_string().replace(&digest(CHECKPOINT), &digest(b"other"));
     let mut swapped = bundle;
     swapped["dsseEnvelope"]["payload"] = STANDARD.encode(other).into();
@@ -207,7 +207,7 @@ fn a_changed_byte_is_noticed() {
 }
 
 #[test]
-fn what_is_wrong_in_a_bundle_is_named() {
+fn faults_of_a_bundle_are_named() {
     type Spoil = fn(&mut Value);
     let cases: [(Spoil, &str); 14] = [
         (|b| b["mediaType"] = "text/plain".into(), "mediaType application/vnd.dev.sigstore"),
@@ -237,7 +237,7 @@ fn what_is_wrong_in_a_bundle_is_named() {
 }
 
 #[test]
-fn what_is_wrong_in_a_statement_is_named() {
+fn faults_of_a_statement_are_named() {
     type Spoil = fn(&mut Value);
     let cases: [(Spoil, Fault, &str); 18] = [
         (|s| s["_type"] = "x".into(), Fault::Malformed, "_type https://in-toto.io/Statement/v1, got \"x\""),
@@ -269,7 +269,7 @@ fn what_is_wrong_in_a_statement_is_named() {
         refused(signed(payload).to_string().as_bytes(), Fault::Malformed, &["a statement in JSON"]);
     }
 
-    // What a later release may add.
+    // Fields that a later release may add.
     let mut more = statement();
     more["more"] = 1.into();
     more["predicate"]["card"] = json!({});
@@ -332,14 +332,14 @@ fn every_changed_byte_of_a_bundle_is_refused_or_means_nothing() {
             accepted.push(at);
         }
     }
-    // Such are the hint and the names of fields that may be left out.
+    // Without effect: the hint, and the names of optional fields.
     let text = String::from_utf8(bundle).unwrap();
     let envelope = text.find("\"payload\"").unwrap()..text.find("\"signatures\"").unwrap();
     assert!(accepted.iter().all(|at| !envelope.contains(at)), "{accepted:?}");
 }
 
 #[test]
-fn no_field_stands_twice() {
+fn duplicate_fields_are_refused() {
     let bundle = good().to_string();
     let twice = bundle.replacen("{\"dsseEnvelope\":", "{\"dsseEnvelope\":null,\"dsseEnvelope\":", 1);
     assert_ne!(twice, bundle);
@@ -359,7 +359,7 @@ fn no_field_stands_twice() {
 }
 
 #[test]
-fn large_and_deep_ones_are_refused() {
+fn large_and_deep_bundles_are_refused() {
     let large = vec![b' '; MAX_BYTES + 1];
     refused(&large, Fault::Malformed, &["at most 65536 bytes, got 65537 bytes"]);
     let mut padded = good().to_string().into_bytes();
@@ -404,7 +404,7 @@ fn files_of_keys_are_checked() {
     assert!(!keys.is_empty() && TrustedKeys::default().is_empty());
 }
 
-/// The models that are shipped are signed, each by the key beside them.
+/// Shipped models are signed with the key beside them.
 #[test]
 fn the_shipped_models_are_signed() {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");

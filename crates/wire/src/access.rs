@@ -1,6 +1,6 @@
-//! Access by role: one table of everything that is offered over the network, and of the roles that offer and use it.
+//! Role-based access control: one table of all endpoints, and of the roles that may offer and use each.
 //!
-//! A router's access control, and the checks of gRPC, openpi and metrics, are made from it.
+//! The access control of routers, gRPC, openpi and metrics is derived from it.
 
 use crate::checkpoint::ListVersionsResponse;
 use crate::planner::{ListModelsResponse, LoadModelRequest, PlanRequest};
@@ -13,21 +13,21 @@ use zenoh::key_expr::OwnedKeyExpr;
 /// Role of a process or person in the network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
-    /// Answers plans.
+    /// Planner service.
     Planner,
-    /// Keeps demonstrations, trains, publishes checkpoints.
+    /// Trainer service: demonstrations, training runs, checkpoints.
     Trainer,
-    /// Simulates.
+    /// Simulator worker.
     Worker,
-    /// Closes the loop, and scores.
+    /// Evaluator: closes the control loop and scores models.
     Evaluator,
-    /// Looks on.
+    /// Read-only observer.
     Viewer,
-    /// Asks for plans.
+    /// Robot or program that requests plans.
     Client,
-    /// Changes what is served and trained.
+    /// Administrator: changes served models and training runs.
     Operator,
-    /// Passes messages on.
+    /// Zenoh router.
     Router,
 }
 
@@ -37,7 +37,7 @@ impl Role {
     /// Every role.
     pub const ALL: [Self; 8] = [Planner, Trainer, Worker, Evaluator, Viewer, Client, Operator, Self::Router];
 
-    /// Its name in identities.
+    /// Name of the role in identities.
     pub fn name(self) -> &'static str {
         match self {
             Planner => "planner",
@@ -75,35 +75,35 @@ impl fmt::Display for Role {
     }
 }
 
-/// Way in which an endpoint is used.
+/// Communication pattern of an endpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// Some answer queries, others send them.
+    /// Queryable and queries.
     Query,
-    /// Some publish, others subscribe.
+    /// Publisher and subscribers.
     Publication,
-    /// Some hold a liveliness token, others watch it.
+    /// Liveliness token and its watchers.
     Liveliness,
 }
 
-/// Something that is offered over the network.
+/// Endpoint of the network: a family of keys with the roles that may use it.
 #[derive(Debug, Clone, Copy)]
 pub struct Endpoint {
-    /// How it is used.
+    /// Communication pattern.
     pub kind: Kind,
     key: fn() -> Result<OwnedKeyExpr, Error>,
     /// Roles that answer, publish or hold the token.
     pub offered_by: &'static [Role],
-    /// Roles that ask, subscribe or watch.
+    /// Roles that query, subscribe or watch.
     pub used_by: &'static [Role],
-    /// Path of the same over gRPC.
+    /// Path of the equivalent gRPC method.
     pub grpc: Option<&'static str>,
-    /// Largest payload, in bytes, of what is sent.
+    /// Largest payload, in bytes.
     pub max_bytes: usize,
 }
 
 impl Endpoint {
-    /// Every key that it is at.
+    /// Key expression that matches every key of the endpoint.
     ///
     /// # Errors
     /// Never: every chunk may be `*`.
@@ -112,10 +112,10 @@ impl Endpoint {
     }
 }
 
-/// Roles that may ask a planner for plans.
+/// Roles that may request plans.
 const PLANS: &[Role] = &[Evaluator, Client, Operator];
 
-/// Everything that is offered. What is not here is denied.
+/// All endpoints; access to any other key is denied.
 pub const ENDPOINTS: &[Endpoint] = &[
     query(|| key::planner_plan("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/Plan"),
     query(|| key::planner_register_goal("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/RegisterGoal"),
@@ -192,13 +192,13 @@ const fn query(
     Endpoint { grpc: Some(grpc), ..zenoh(Kind::Query, key, offered_by, used_by) }
 }
 
-/// Whether an identity may call a method of gRPC, by its path.
+/// Whether an identity may call the gRPC method at `path`.
 pub fn may_call(identity: &str, path: &str) -> bool {
     let endpoint = ENDPOINTS.iter().find(|endpoint| endpoint.grpc == Some(path));
     endpoint.zip(Role::of(identity)).is_some_and(|(endpoint, role)| endpoint.used_by.contains(&role))
 }
 
-/// Whether an identity may ask for plans.
+/// Whether an identity may request plans.
 pub fn may_plan(identity: &str) -> bool {
     Role::of(identity).is_some_and(|role| PLANS.contains(&role))
 }

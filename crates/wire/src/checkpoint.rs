@@ -1,4 +1,4 @@
-//! Publishing checkpoints, from the trainer to planners.
+//! Checkpoint publishing, from the trainer to planners.
 
 use crate::message::{digest, name, required};
 use crate::{Error, Message, proto};
@@ -11,105 +11,105 @@ pub const MAX_SIGNATURE_BUNDLE_BYTES: usize = 65_536;
 /// Most parents of a checkpoint.
 const MAX_PARENTS: usize = 64;
 
-/// What a published checkpoint is. As JSON it lies beside the weights.
+/// Manifest of a published checkpoint; stored as JSON beside the weights.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CheckpointManifest {
     /// Name to serve the model under.
     pub model: String,
-    /// Counts the checkpoints of this name, from 1.
+    /// Version number within the name, from 1.
     pub version: u32,
     /// SHA-256 of the checkpoint, in hex.
     pub digest: String,
-    /// Its size.
+    /// Size of the checkpoint, in bytes.
     pub size_bytes: u64,
     /// SHA-256 of the model's configuration, in hex.
     pub config_digest: String,
-    /// Digests of what it was made from, in hex.
+    /// SHA-256 of the checkpoints that it was derived from, in hex.
     pub parents: Vec<String>,
     /// Signature of the checkpoint, a bundle of OpenSSF Model Signing in JSON; not verified.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signature_bundle: Option<String>,
 }
 
-/// Tells planners which version of a model to serve.
+/// Announcement of the version of a model that planners should serve.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CheckpointAnnouncement {
-    /// What to serve.
+    /// Manifest of the promoted checkpoint.
     pub manifest: CheckpointManifest,
-    /// Of two announcements the one with the greater value holds.
+    /// Time of the promotion, in nanoseconds since the Unix epoch; the latest announcement wins.
     pub promoted_unix_nanos: u64,
 }
 
-/// Asks for one piece of a published checkpoint.
+/// Request for a byte range of a published checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CheckpointChunkRequest {
     /// SHA-256 of the checkpoint, in hex.
     pub digest: String,
-    /// Where the piece starts.
+    /// Offset of the range, in bytes.
     pub offset_bytes: u64,
-    /// How long it is.
+    /// Length of the range, in bytes.
     pub length_bytes: u32,
 }
 
-/// One piece of a checkpoint.
+/// Byte range of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CheckpointChunkResponse {
-    /// The bytes asked for.
+    /// Bytes of the range.
     pub data: Vec<u8>,
 }
 
-/// Asks for the versions that are kept.
+/// Request for the stored versions.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ListVersionsRequest {
-    /// Of one model, or of all.
+    /// Name of one model; all models if none.
     pub model: Option<String>,
 }
 
-/// The versions that are kept.
+/// Stored versions.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ListVersionsResponse {
-    /// By model and version.
+    /// Versions, ordered by model and number.
     pub versions: Vec<CheckpointVersion>,
 }
 
-/// A version that is kept.
+/// Stored version of a model.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct CheckpointVersion {
-    /// What it is.
+    /// Manifest of the version.
     #[serde(flatten)]
     pub manifest: CheckpointManifest,
-    /// Whether it is the one that planners are told to serve.
+    /// Whether planners are told to serve this version.
     pub promoted: bool,
 }
 
-/// Lets planners serve a version that is kept.
+/// Request that planners serve a stored version.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PromoteVersionRequest {
     /// Name of the model.
     pub model: String,
-    /// The version to serve.
+    /// Version to serve.
     pub version: u32,
 }
 
-/// The version that is promoted now.
+/// Version that is now promoted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PromoteVersionResponse {
-    /// What it is.
+    /// Manifest of the version.
     pub manifest: CheckpointManifest,
 }
 
-/// Lets planners serve the version that was promoted before.
+/// Request that planners serve the previously promoted version.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RollBackRequest {
     /// Name of the model.
     pub model: String,
 }
 
-/// The version that is promoted now.
+/// Version that is now promoted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RollBackResponse {
-    /// What it is.
+    /// Manifest of the version.
     pub manifest: CheckpointManifest,
 }
 
@@ -130,6 +130,7 @@ impl TryFrom<proto::CheckpointManifest> for CheckpointManifest {
             parents,
             signature_bundle,
         } = manifest;
+
         if parents.len() > MAX_PARENTS {
             return Err(Error::invalid("parents", format!("at most {MAX_PARENTS}"), parents.len()));
         }
@@ -137,6 +138,7 @@ impl TryFrom<proto::CheckpointManifest> for CheckpointManifest {
             let (expected, got) = (format!("at most {MAX_SIGNATURE_BUNDLE_BYTES} bytes"), signature_bundle.len());
             return Err(Error::invalid("signature_bundle", expected, format!("{got} bytes")));
         }
+
         Ok(Self {
             model: name("model", model)?,
             version: version(number)?,
@@ -240,7 +242,7 @@ impl From<ListVersionsRequest> for proto::ListVersionsRequest {
 
 impl Message for ListVersionsResponse {
     type Proto = proto::ListVersionsResponse;
-    /// Every version may have a signature.
+    /// Larger than the default: every version may carry a signature bundle.
     const MAX_BYTES: usize = 16 << 20;
 }
 
@@ -345,7 +347,7 @@ impl From<RollBackResponse> for proto::RollBackResponse {
     }
 }
 
-/// A version of a model: 1 or more.
+/// Validates a version number: 1 or more.
 fn version(number: u32) -> Result<u32, Error> {
     if number == 0 { Err(Error::invalid("version", "1 or more", number)) } else { Ok(number) }
 }

@@ -1,4 +1,4 @@
-//! The demonstration stream, from workers to the trainer, and what a recorder holds of it.
+//! Demonstration stream, from workers to the trainer, and recorded demonstrations.
 
 use crate::image::render_spec;
 use crate::message::{action, digest as checked_digest, finite, name, position, required};
@@ -6,52 +6,52 @@ use crate::sim::Variation;
 use crate::{Error, Image, Message, proto};
 use sha2::{Digest, Sha256};
 
-/// Most steps of an episode.
+/// Maximum number of steps of an episode.
 pub const MAX_STEPS: u32 = 1000;
-/// Most values of a state.
+/// Maximum length of a state vector.
 const MAX_STATE: usize = 1024;
-/// Most actions in a second of simulated time.
+/// Highest control rate, in actions per second of simulated time.
 const MAX_CONTROL_HZ: f64 = 10_000.0;
 
 /// One numbered step of an episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DemonstrationStep {
-    /// The episode.
+    /// Identifier of the episode.
     pub episode_id: String,
-    /// Its number, from 0.
+    /// Step number, from 0.
     pub step: u32,
-    /// What the camera showed.
+    /// Camera image before the action.
     pub frame: Image,
-    /// What the expert did; none at the last step, whose frame is the goal.
+    /// Action of the expert; none at the last step, whose frame is the goal.
     pub action: Option<Vec<f32>>,
-    /// What the simulator knows of itself before the action; the hand's x, y, z in metres come first. At most 1024.
+    /// Simulator state before the action, at most 1024 values; the hand's x, y, z in metres come first.
     pub state: Vec<f32>,
-    /// What the action before this step brought; 0 at the first.
+    /// Reward of the previous action; 0 at the first step.
     pub reward: f32,
     /// Whether the task is solved at this step.
     pub success: bool,
 }
 
-/// A whole episode, without its steps: as its sender commits it, and as its recording begins.
+/// Metadata of a complete episode: committed by its sender, and the header of its recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedEpisode {
-    /// The episode.
+    /// Identifier of the episode.
     pub episode_id: String,
-    /// What was demonstrated.
+    /// Demonstrated variation.
     pub variation: Variation,
     /// Number of steps, goal frame included.
     pub steps: u32,
-    /// What [`digest`] gives for the steps.
+    /// SHA-256 of the steps, in hex; see [`digest`].
     pub digest: String,
-    /// Where the goal is: x, y, z in metres; empty if it is no position.
+    /// Goal position x, y, z in metres; empty if the goal is no position.
     pub goal_position: Vec<f32>,
-    /// Actions per second of simulated time.
+    /// Control rate, in actions per second of simulated time.
     pub control_hz: f64,
-    /// Of every frame; see [`Image::render_spec`].
+    /// Render spec of every frame; see [`Image::render_spec`].
     pub render_spec: String,
 }
 
-/// A step without its frame, as a recording has it beside; the fields are those of [`DemonstrationStep`].
+/// Step without its frame, which a recording stores separately; the fields are those of [`DemonstrationStep`].
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "see DemonstrationStep")]
 pub struct RecordedStep {
@@ -63,30 +63,30 @@ pub struct RecordedStep {
 }
 
 impl RecordedStep {
-    /// The step as it was sent.
+    /// Full step, with the episode's identifier and the frame.
     pub fn with_frame(self, episode_id: String, frame: Image) -> DemonstrationStep {
         let Self { step, action, state, reward, success } = self;
         DemonstrationStep { episode_id, step, frame, action, state, reward, success }
     }
 }
 
-/// Closes an episode.
+/// Request to store an episode once every step has arrived.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommitEpisodeRequest {
-    /// What is to be kept once every step is there.
+    /// Metadata of the episode.
     pub episode: RecordedEpisode,
 }
 
-/// What the receiver still lacks.
+/// Steps that the recorder has not received.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommitEpisodeResponse {
-    /// Steps to send again; none when the episode is kept.
+    /// Numbers of the steps to send again; empty once the episode is stored.
     pub missing_steps: Vec<u32>,
 }
 
-/// SHA-256, in hex, over the steps in order, each as pixels, action, state and reward (little-endian 32-bit floats), and
-/// one byte that is 1 for success. A step without an action adds nothing for it. A reward of -0 counts as 0, since protobuf
-/// keeps no sign of a zero.
+/// SHA-256, in hex, over the steps in order: each step's pixels, then action, state and reward as little-endian 32-bit
+/// floats, then one byte for success (1 or 0). A missing action adds no bytes. A reward of -0 counts as 0, since protobuf
+/// drops the sign of a zero.
 pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> String {
     let mut hasher = Sha256::new();
     for DemonstrationStep { frame, action, state, reward, success, .. } in steps {

@@ -1,47 +1,47 @@
-//! The one error that services answer with, over zenoh and gRPC alike.
+//! Error type of all services, over zenoh and gRPC alike.
 
 use crate::proto;
 use prost::Message as _;
 
-/// Longest `expected` and `got`, in bytes: a stranger's text may be in them, and they travel in gRPC headers, where a long
+/// Longest `expected` and `got`, in bytes: both may quote untrusted text, and they travel in gRPC headers, where an overlong
 /// one would end the whole connection.
 const MAX_TEXT_BYTES: usize = 500;
 
-/// What kind of fault it is; each is the gRPC status of the same name.
+/// Error code; each is the gRPC status of the same name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Code {
-    /// The request itself is wrong and will stay wrong.
+    /// Invalid request; retrying does not help.
     InvalidArgument,
-    /// What the request names does not exist.
+    /// Unknown name or id.
     NotFound,
-    /// The request does not fit the state of the service.
+    /// Request that does not fit the state of the service.
     FailedPrecondition,
-    /// A queue or size limit is reached: try again later.
+    /// Full queue or exceeded size limit: retry later.
     ResourceExhausted,
-    /// The request's deadline passed.
+    /// Expired deadline.
     DeadlineExceeded,
-    /// Nobody answered: try again.
+    /// No answer: retry.
     Unavailable,
-    /// A fault of the service itself.
+    /// Fault of the service itself.
     Internal,
 }
 
-/// Why a request was refused.
+/// Refusal of a request.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: expected {expected}, got {got}")]
 pub struct Error {
-    /// The kind of fault.
+    /// Error code.
     pub code: Code,
-    /// The request's field at fault, for example `observation.data`.
+    /// Path of the field at fault in the request, for example `observation.data`.
     pub field: String,
-    /// What would have been right.
+    /// Description of a valid value.
     pub expected: String,
-    /// What came.
+    /// The value that came.
     pub got: String,
 }
 
 impl Error {
-    /// An error of the given kind about a field; what is too long is cut.
+    /// Error about a field; overlong `expected` and `got` are truncated.
     pub fn new(code: Code, field: impl Into<String>, expected: impl ToString, got: impl ToString) -> Self {
         let cut = |mut text: String| {
             if text.len() > MAX_TEXT_BYTES {
@@ -53,19 +53,19 @@ impl Error {
         Self { code, field: field.into(), expected: cut(expected.to_string()), got: cut(got.to_string()) }
     }
 
-    /// A request that is wrong in a field.
+    /// [`Code::InvalidArgument`] about a field.
     pub fn invalid(field: impl Into<String>, expected: impl ToString, got: impl ToString) -> Self {
         Self::new(Code::InvalidArgument, field, expected, got)
     }
 
-    /// The same error about a field of the message that holds this one.
+    /// The same error, with the field's path prefixed by that of the enclosing message.
     #[must_use]
     pub fn within(mut self, outer: &str) -> Self {
         self.field = if self.field.is_empty() { outer.to_owned() } else { format!("{outer}.{}", self.field) };
         self
     }
 
-    /// The field at fault if it is missing from its message.
+    /// [`Code::InvalidArgument`] about a missing field.
     pub(crate) fn missing(field: &str) -> Self {
         Self::invalid(field, "a value", "none")
     }
@@ -129,7 +129,7 @@ impl From<Error> for tonic::Status {
 }
 
 impl From<tonic::Status> for Error {
-    /// Reads the details of a status that a CPN service sent; any other is a fault of the transport.
+    /// Decodes the details of a CPN service's status; a status without them is an error of the transport.
     fn from(status: tonic::Status) -> Self {
         match proto::Error::decode(status.details()) {
             Ok(error) if !status.details().is_empty() => error.into(),

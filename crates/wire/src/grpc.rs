@@ -1,14 +1,14 @@
-//! What every gRPC service does with its messages.
+//! Conversions shared by all gRPC services.
 
 use crate::{Error, Message};
 use std::future::Future;
 use tonic::codegen::http;
 use tonic::{Request, Response, Status};
 
-/// Checks a request, serves it, and answers.
+/// Validates a request, serves it, and encodes the answer.
 ///
 /// # Errors
-/// What is wrong with the request, or what the service refuses.
+/// If the request is invalid, or the service refuses it.
 pub async fn answer<Q: Message, R: Message, F>(
     request: Request<Q::Proto>,
     serve: impl FnOnce(Q) -> F,
@@ -20,8 +20,8 @@ where
     Ok(Response::new(serve(request).await?.into()))
 }
 
-/// Turns tonic's own refusals of a message, which come without details, into what the other transports answer: a
-/// message that is too long or is not protobuf is the client's fault, not `INTERNAL`.
+/// Replaces tonic's own refusals of a message, which carry no details, by the error of the other transports: a message
+/// that is too long or is not protobuf is `INVALID_ARGUMENT`, not `INTERNAL`.
 pub fn name_unreadable_payload<B>(mut response: http::Response<B>) -> http::Response<B> {
     let Some(status) = Status::from_header_map(response.headers()).filter(|status| status.details().is_empty()) else {
         return response;
@@ -31,7 +31,7 @@ pub fn name_unreadable_payload<B>(mut response: http::Response<B>) -> http::Resp
         tonic::Code::Internal => "a protobuf message",
         _ => return response,
     };
-    // A refusal that cannot be put in a header goes as tonic wrote it.
+    // A refusal that does not fit in a header stays as tonic wrote it.
     let _ = Status::from(Error::invalid("payload", expected, status.message())).add_header(response.headers_mut());
     response
 }

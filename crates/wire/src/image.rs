@@ -9,7 +9,7 @@ const MAX_SIDE: u32 = 512;
 /// Longest render spec, in bytes.
 const MAX_RENDER_SPEC_BYTES: usize = 1024;
 
-/// An RGB8 image: rows from the top, red, green and blue interleaved.
+/// RGB8 image, `[height, width, 3]` bytes: rows from the top, channels interleaved.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Image {
     height: u32,
@@ -19,10 +19,10 @@ pub struct Image {
 }
 
 impl Image {
-    /// A real camera's image of `height * width * 3` bytes.
+    /// Image of a real camera, from `height * width * 3` bytes.
     ///
     /// # Errors
-    /// If a side is 0 or too large, or the data does not fit the sides.
+    /// If a side is 0 or above 512 pixels, or the length of the data is not `height * width * 3`.
     pub fn new(height: u32, width: u32, data: Vec<u8>) -> Result<Self, Error> {
         for (field, side) in [("height", height), ("width", width)] {
             if !(1..=MAX_SIDE).contains(&side) {
@@ -36,8 +36,7 @@ impl Image {
         Ok(Self { height, width, data, render_spec: String::new() })
     }
 
-    /// The same image as a simulator's: `spec` is its own JSON for how it was rendered, opaque here; empty for a real
-    /// camera's picture.
+    /// The same image, rendered by a simulator with the configuration `spec`: JSON, opaque here; empty for a real camera.
     ///
     /// # Errors
     /// If the spec is longer than 1024 bytes.
@@ -55,17 +54,17 @@ impl Image {
         self.width
     }
 
-    /// The pixels, `height * width * 3` bytes.
+    /// Pixels, `height * width * 3` bytes.
     pub fn data(&self) -> &[u8] {
         &self.data
     }
 
-    /// How it was rendered; empty for a real camera's picture.
+    /// Configuration of camera and renderer, in JSON; empty for a real camera.
     pub fn render_spec(&self) -> &str {
         &self.render_spec
     }
 
-    /// SHA-256 of shape, format, pixels and render spec, in hex: the id of a goal.
+    /// SHA-256 of format, shape, pixels and render spec, in hex: the goal id.
     pub fn digest(&self) -> String {
         let mut hasher = Sha256::new();
         hasher.update(b"rgb8");
@@ -77,7 +76,7 @@ impl Image {
     }
 }
 
-/// A render spec of bounded length.
+/// Validates the length of a render spec.
 pub(crate) fn render_spec(field: &str, spec: String) -> Result<String, Error> {
     if spec.len() <= MAX_RENDER_SPEC_BYTES {
         Ok(spec)

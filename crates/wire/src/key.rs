@@ -1,6 +1,6 @@
-//! Every zenoh key, once. The verbatim chunk `@v1` seals the version: `cpn/**` does not match it.
+//! All zenoh key expressions. The verbatim chunk `@v1` is the protocol version: `cpn/**` does not match it.
 //!
-//! Each function takes the variable chunks of its key; `"*"` selects all of them.
+//! Each function takes the variable chunks of its key; `"*"` matches any value of a chunk.
 
 use crate::Error;
 use zenoh::key_expr::{OwnedKeyExpr, keyexpr};
@@ -14,7 +14,7 @@ macro_rules! keys {
             $(#[$doc])*
             ///
             /// # Errors
-            /// If a name cannot stand in a key.
+            /// If a chunk is not valid in a key expression.
             pub fn $name($($chunk: &str),+) -> Result<OwnedKeyExpr, Error> {
                 zenoh::key_expr::format::keformat!(format::$name::formatter(), $($chunk = $chunk),+).map_err(|_| {
                     let got = [$(format!("{:?}", $chunk)),+].join(", ");
@@ -76,17 +76,17 @@ keys! {
     sim_alive(worker) = "cpn/@v1/alive/sim/${worker:*}";
 }
 
-/// The worker's name in the key of its liveliness token.
+/// Worker's name in the key of its liveliness token.
 pub fn worker_of_sim_alive(key: &keyexpr) -> Option<String> {
     Some(format::sim_alive::parse(key).ok()?.worker().to_string())
 }
 
-/// The episode, or `*`, in the key of its steps.
+/// Episode identifier, or `*`, in the key of an episode's steps.
 pub fn episode_of_demonstration_step(key: &keyexpr) -> Option<String> {
     Some(format::demonstration_step::parse(key).ok()?.episode().to_string())
 }
 
-/// The episode, or `*`, in the key of its recording.
+/// Episode identifier, or `*`, in the key of a recording.
 pub fn episode_of_demonstration_recorded(key: &keyexpr) -> Option<String> {
     Some(format::demonstration_recorded::parse(key).ok()?.episode().to_string())
 }

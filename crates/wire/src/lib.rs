@@ -1,7 +1,7 @@
-//! Everything that crosses the network: protobuf messages, their native types, zenoh keys, and queries.
+//! Network protocol: protobuf messages, their native types, zenoh keys, and queries.
 //!
-//! Bytes become native types here and nowhere else: [`decode`] bounds the size, parses, and checks every field, so that
-//! the services see valid values only. Each message has both directions, held to each other by a property test.
+//! Bytes are decoded into native types here and nowhere else: [`decode`] bounds the size, parses, and validates every
+//! field, so that services see valid values only. A property test round-trips every message.
 
 pub mod access;
 pub mod checkpoint;
@@ -30,7 +30,6 @@ pub use observation::{Observation, Position};
 pub mod proto {
     tonic::include_proto!("cpn.v1");
 
-    /// The encoded `FileDescriptorSet` of every message, for gRPC reflection and the schemas of
-    /// recordings.
+    /// Encoded `FileDescriptorSet` of all messages, for gRPC reflection and the schemas of recordings.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 }

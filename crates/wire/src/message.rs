@@ -1,28 +1,28 @@
-//! From bytes to valid native values and back.
+//! Encoding and validating decoding of messages.
 
 use crate::Error;
 use prost::Message as _;
 
-/// Most values of an action.
+/// Maximum length of an action.
 const MAX_ACTION: usize = 64;
 
-/// A native type with a protobuf message; the conversion from the message checks every field.
+/// Native type of a protobuf message; the conversion from the message validates every field.
 pub trait Message: TryFrom<Self::Proto, Error = Error> + Into<Self::Proto> {
-    /// The generated type.
+    /// Generated protobuf type.
     type Proto: prost::Message + prost::Name + Default;
-    /// Largest encoded size that is decoded.
+    /// Largest encoded size that [`decode`] accepts, in bytes.
     const MAX_BYTES: usize = 1 << 20;
 }
 
-/// The protobuf bytes of a message.
+/// Encodes a message as protobuf.
 pub fn encode<M: Message>(message: M) -> Vec<u8> {
     message.into().encode_to_vec()
 }
 
-/// A valid message from a stranger's bytes.
+/// Decodes and validates untrusted protobuf bytes.
 ///
 /// # Errors
-/// If there are too many bytes, they are not the message, or a field is wrong.
+/// If there are more than [`Message::MAX_BYTES`], they are not the message, or a field is invalid.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, Error> {
     if bytes.len() > M::MAX_BYTES {
         let got = format!("{} bytes", bytes.len());
@@ -33,12 +33,12 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, Error> {
     M::try_from(proto)
 }
 
-/// The value of a message field that must be there, checked by its own conversion.
+/// Value of a required message field, validated by its own conversion.
 pub(crate) fn required<P, N: TryFrom<P, Error = Error>>(field: &str, value: Option<P>) -> Result<N, Error> {
     N::try_from(value.ok_or_else(|| Error::missing(field))?).map_err(|e| e.within(field))
 }
 
-/// A name that can stand in a key and in a file name: 1 to 64 of `a-z 0-9 . _ -`, not starting with a dot.
+/// Validates a name, which must be usable in a key and as a file name: 1 to 64 of `a-z 0-9 . _ -`, not starting with a dot.
 pub(crate) fn name(field: &str, value: String) -> Result<String, Error> {
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "._-".contains(c);
     if (1..=64).contains(&value.len()) && value.chars().all(allowed) && !value.starts_with('.') {
@@ -48,7 +48,7 @@ pub(crate) fn name(field: &str, value: String) -> Result<String, Error> {
     }
 }
 
-/// A SHA-256 digest in lower-case hex.
+/// Validates a SHA-256 digest in lower-case hex.
 pub(crate) fn digest(field: &str, value: String) -> Result<String, Error> {
     if value.len() == 64 && value.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b)) {
         Ok(value)
@@ -57,7 +57,7 @@ pub(crate) fn digest(field: &str, value: String) -> Result<String, Error> {
     }
 }
 
-/// An action: 1 to 64 values, all finite.
+/// Validates an action: 1 to 64 values, all finite.
 pub(crate) fn action(action: crate::proto::Action) -> Result<Vec<f32>, Error> {
     if !(1..=MAX_ACTION).contains(&action.values.len()) {
         return Err(Error::invalid("values", format!("1 to {MAX_ACTION} numbers"), action.values.len()));
@@ -65,7 +65,7 @@ pub(crate) fn action(action: crate::proto::Action) -> Result<Vec<f32>, Error> {
     finite("values", action.values)
 }
 
-/// Numbers that are all finite.
+/// Validates that all values are finite.
 pub(crate) fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, Error> {
     match values.iter().find(|value| !value.is_finite()) {
         Some(value) => Err(Error::invalid(field, "finite numbers", value)),
@@ -73,7 +73,7 @@ pub(crate) fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, Error> {
     }
 }
 
-/// A position x, y, z in metres, or none.
+/// Validates a position x, y, z in metres, or no values for none.
 pub(crate) fn position(field: &str, values: Vec<f32>) -> Result<Vec<f32>, Error> {
     if [0, 3].contains(&values.len()) {
         finite(field, values)

@@ -1,23 +1,23 @@
-//! What a model plans from and towards.
+//! Observations and goals: camera images, or positions of the hand.
 
 use crate::{Error, Image, proto};
 use sha2::{Digest, Sha256};
 
-/// Farthest that a position may lie from the origin along an axis.
+/// Largest absolute coordinate of a position, in metres.
 const MAX_METRES: f32 = 1000.0;
 
-/// A point in the world frame.
+/// Position in the world frame, in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Position([f32; 3]);
 
 impl Position {
-    /// x, y, z in metres.
+    /// Position of the coordinates x, y, z in metres.
     ///
     /// # Errors
-    /// If one of them is not a number, or farther than 1 km.
+    /// If a coordinate is not a number, or beyond 1 km.
     pub fn new(metres: [f32; 3]) -> Result<Self, Error> {
         for (field, value) in ["x", "y", "z"].into_iter().zip(metres) {
-            // Written so that NaN, which compares false with everything, is refused too.
+            // In this form NaN, which compares false with everything, is refused too.
             if !(-MAX_METRES..=MAX_METRES).contains(&value) {
                 return Err(Error::invalid(field, format!("-{MAX_METRES} to {MAX_METRES} metres"), value));
             }
@@ -25,7 +25,7 @@ impl Position {
         Ok(Self(metres))
     }
 
-    /// x, y, z in metres.
+    /// Coordinates x, y, z in metres.
     pub fn metres(self) -> [f32; 3] {
         self.0
     }
@@ -45,17 +45,17 @@ impl From<Position> for proto::Position {
     }
 }
 
-/// A picture, or where the hand is or is to go.
+/// Observation, or goal, of a task.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Observation {
-    /// What the camera shows.
+    /// Camera image.
     Image(Image),
-    /// A position of the hand.
+    /// Position of the hand.
     Position(Position),
 }
 
 impl Observation {
-    /// SHA-256 of everything in it, in hex: the id of a goal.
+    /// SHA-256 of the contents, in hex: the goal id.
     pub fn digest(&self) -> String {
         match self {
             Self::Image(image) => image.digest(),
@@ -68,7 +68,7 @@ impl Observation {
         }
     }
 
-    /// How it was rendered; empty for what was not.
+    /// Render spec of an image; empty for a real camera's image, and for a position.
     pub fn render_spec(&self) -> &str {
         match self {
             Self::Image(image) => image.render_spec(),

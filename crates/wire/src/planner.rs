@@ -1,158 +1,158 @@
-//! Requests to the planner service and its answers.
+//! Requests and responses of the planner service.
 
 use crate::message::{action, digest, name, required};
 pub use crate::search::{Search, Solver};
 use crate::{Error, Image, Message, Observation, Position, proto};
 use std::time::Duration;
 
-/// Most actions of a plan.
+/// Longest plan, in actions.
 const MAX_HORIZON: usize = 64;
-/// Largest number, up or down, of an action that a search begins with; what is executed is clipped to 1.
-const MAX_START: f32 = 1000.0;
+/// Largest absolute value in a warm start; executed actions are clipped to [-1, 1].
+const MAX_WARM_START: f32 = 1000.0;
 
-/// Where to plan to.
+/// Goal of a plan.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// A goal registered before.
+    /// Id of a registered goal.
     Id(String),
-    /// A picture of the finished task.
+    /// Camera image of the finished task.
     Image(Image),
-    /// Where the hand is to go.
+    /// Target position of the hand.
     Position(Position),
 }
 
-/// Asks for the next actions towards a goal.
+/// Request for a plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlanRequest {
     /// Name of the model.
     pub model: String,
-    /// Where to plan to.
+    /// Goal of the plan.
     pub goal: Goal,
-    /// What the camera shows now, or where the hand is.
+    /// Current observation.
     pub observation: Observation,
-    /// Drives whatever is random in the model.
+    /// Seed of all randomness: the same request and seed get the same answer.
     pub seed: u64,
-    /// How long after its arrival the answer is still of use, in whole milliseconds.
+    /// Time limit, counted from the request's arrival, in whole milliseconds.
     pub deadline: Option<Duration>,
-    /// The checkpoint that must answer; any if none.
+    /// SHA-256 of the required checkpoint, in hex; any checkpoint if none.
     pub model_digest: Option<String>,
-    /// How to search for the actions; the model's own way if none.
+    /// Search for the actions; the model's default if none.
     pub search: Option<Search>,
-    /// Actions to search from, horizon long; the policy's if there are none.
+    /// Initial plan of the search, `[horizon, actions]`; the policy's plan if empty.
     pub warm_start: Vec<Vec<f32>>,
 }
 
-/// A plan.
+/// Plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlanResponse {
-    /// The whole sequence, horizon long; not clipped.
+    /// Planned actions, `[horizon, actions]`, not clipped.
     pub actions: Vec<Vec<f32>>,
-    /// The action to apply now, each value in [-1, 1].
+    /// Action to apply now: the first of the plan, clipped to [-1, 1].
     pub first_action: Vec<f32>,
-    /// The inner loss before each update and after the last; empty for methods that do not plan.
+    /// Inner loss before each update and after the last; empty for methods that do not plan.
     pub inner_losses: Vec<f32>,
-    /// Euclidean distance between the observation's and the goal's embedding; none for the random method.
+    /// Euclidean distance between the embeddings of observation and goal; none for the random method.
     pub latent_distance: Option<f32>,
-    /// Where the time went.
+    /// Time spent in each stage.
     pub times: StageTimes,
     /// SHA-256 of the checkpoint that answered, in hex.
     pub model_digest: String,
     /// Id under which the goal is now registered.
     pub goal_id: String,
-    /// Iterations after which this plan was found.
+    /// Iteration at which this plan was found.
     pub iterations: u32,
-    /// Iterations that were run.
+    /// Iterations run in total.
     pub iterations_run: u32,
-    /// The plan moved on by one step; empty for methods that do not plan.
+    /// Warm start of the next request: the plan shifted by one step; empty for methods that do not plan.
     pub warm_start: Vec<Vec<f32>>,
 }
 
-/// Where the time of a request went, in seconds.
+/// Time spent in each stage of a request, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct StageTimes {
-    /// Waiting for the model.
+    /// Waiting in the queue.
     pub queue_seconds: f64,
-    /// Embedding the observation and, if it was not cached, the goal.
+    /// Embedding of the observation and, if it was not cached, of the goal.
     pub encode_seconds: f64,
-    /// Planning.
+    /// Search for the plan.
     pub plan_seconds: f64,
 }
 
-/// Keeps a goal image.
+/// Request to register a goal image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RegisterGoalRequest {
-    /// A picture of the finished task.
+    /// Camera image of the finished task.
     pub image: Image,
 }
 
-/// The id of a kept goal.
+/// Id of a registered goal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RegisterGoalResponse {
-    /// [`Image::digest`].
+    /// [`Image::digest`] of the goal.
     pub goal_id: String,
 }
 
-/// Where a checkpoint comes from.
+/// Source of a checkpoint.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CheckpointSource {
-    /// A file name inside the planner's own model folder.
+    /// File name in the planner's model folder.
     File(String),
-    /// A whole checkpoint.
+    /// Bytes of the whole checkpoint.
     Bytes(Vec<u8>),
 }
 
-/// Swaps in another checkpoint.
+/// Request to serve a checkpoint, in place of the one under its name if there is one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadModelRequest {
     /// Name to serve the model under.
     pub model: String,
-    /// Where the checkpoint comes from.
+    /// Source of the checkpoint.
     pub source: CheckpointSource,
 }
 
-/// The model that is now served.
+/// Model that is now served.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadModelResponse {
-    /// What is known of it.
+    /// Description of the model.
     pub model: ModelInfo,
 }
 
-/// Serves a model no longer.
+/// Request to serve a model no longer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UnloadModelRequest {
     /// Name the model is served under.
     pub model: String,
 }
 
-/// The model is no longer served.
+/// Confirmation that the model is no longer served.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UnloadModelResponse;
 
-/// Asks for the served models.
+/// Request for the served models.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ListModelsRequest;
 
-/// The served models.
+/// Served models.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ListModelsResponse {
-    /// Ordered by name.
+    /// Models, ordered by name.
     pub models: Vec<ModelInfo>,
 }
 
-/// A served model.
+/// Description of a served model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelInfo {
     /// Name it is served under.
     pub name: String,
-    /// `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    /// Method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
     pub method: String,
     /// SHA-256 of its checkpoint, in hex.
     pub digest: String,
     /// Tasks it was trained on.
     pub training_tasks: Vec<String>,
-    /// Number of actions in a plan.
+    /// Planning horizon, in actions.
     pub horizon: u32,
-    /// That of its manifest; 0 for a checkpoint that was not published.
+    /// Version in its manifest; 0 for a checkpoint that was not published.
     pub version: u32,
 }
 
@@ -163,17 +163,17 @@ fn actions(field: &str, actions: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Er
     actions.into_iter().map(action).collect::<Result<_, _>>().map_err(|e| e.within(field))
 }
 
-/// Actions from which numbers of no sense cannot follow.
-fn start(field: &str, start: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Error> {
-    let start = actions(field, start)?;
-    match start.iter().flatten().find(|value| value.abs() > MAX_START) {
-        Some(value) => Err(Error::invalid(field, format!("numbers from -{MAX_START} to {MAX_START}"), value)),
-        None => Ok(start),
+/// Validates a warm start: values are bounded, since a search from huge ones would overflow.
+fn warm_start(field: &str, plan: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Error> {
+    let plan = actions(field, plan)?;
+    match plan.iter().flatten().find(|value| value.abs() > MAX_WARM_START) {
+        Some(value) => Err(Error::invalid(field, format!("numbers from -{MAX_WARM_START} to {MAX_WARM_START}"), value)),
+        None => Ok(plan),
     }
 }
 
 impl PlanRequest {
-    /// Asks for a plan by the model's own search, seed 0, whenever it comes.
+    /// Request with the model's default search, seed 0, and no deadline.
     pub fn new(model: impl Into<String>, goal: Goal, observation: Observation) -> Self {
         Self {
             model: model.into(),
@@ -205,6 +205,7 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 Goal::Position(position.try_into().map_err(|e: Error| e.within("goal_position"))?)
             }
         };
+
         let observation = match request.observed.ok_or_else(|| Error::missing("observation"))? {
             proto::plan_request::Observed::Observation(image) => {
                 Observation::Image(image.try_into().map_err(|e: Error| e.within("observation"))?)
@@ -213,10 +214,12 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 Observation::Position(position.try_into().map_err(|e: Error| e.within("position"))?)
             }
         };
+
         let search = request.search.map(Search::try_from).transpose().map_err(|e| e.within("search"))?;
         if search.is_some_and(|search| search.anytime) && request.deadline_ms == 0 {
             return Err(Error::invalid("deadline_ms", "a limit, for a search that goes on until then", 0));
         }
+
         Ok(Self {
             model: name("model", request.model)?,
             goal,
@@ -227,7 +230,7 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 .then(|| digest("model_digest", request.model_digest))
                 .transpose()?,
             search,
-            warm_start: start("warm_start", request.warm_start)?,
+            warm_start: warm_start("warm_start", request.warm_start)?,
         })
     }
 }

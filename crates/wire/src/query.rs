@@ -1,4 +1,4 @@
-//! Request and reply over zenoh queries, typed on both sides.
+//! Typed request and reply over zenoh queries.
 
 use crate::{Code, Error, Message, decode, encode, proto, trace};
 use prost::{Message as _, Name};
@@ -9,16 +9,16 @@ use zenoh::key_expr::{OwnedKeyExpr, keyexpr};
 use zenoh::query::{ConsolidationMode, Query, Reply};
 use zenoh::{Session, Wait};
 
-/// The encoding that marks a payload as message `N`.
+/// Zenoh encoding of a payload that is the protobuf message `N`.
 pub fn encoding<N: Name>() -> Encoding {
     Encoding::APPLICATION_PROTOBUF.with_schema(N::full_name())
 }
 
-/// Sends a request and awaits its one answer.
+/// Sends a request and awaits its single answer.
 ///
 /// # Errors
-/// What the service answered; [`Code::Unavailable`] if nobody serves the key, or, about the field `session`, if no router or
-/// peer is connected; [`Code::DeadlineExceeded`] if no answer came in time.
+/// The service's own error; [`Code::Unavailable`] if no service answers at the key, or, about the field `session`, if no
+/// router or peer is connected; [`Code::DeadlineExceeded`] if no answer came in time.
 pub async fn call<Q: Message, R: Message>(
     session: &Session,
     key: &OwnedKeyExpr,
@@ -38,15 +38,15 @@ pub async fn call<Q: Message, R: Message>(
             .map_err(unavailable)?;
         // Right after a reconnect a query can end at once without any reply.
         let Ok(reply) = replies.recv_async().await else {
-            return Err(nobody(session, key).await);
+            return Err(no_reply(session, key).await);
         };
         decode_reply(reply, key, timeout)
     };
     ask.instrument(debug_span!("query", otel.kind = "client", %key)).await
 }
 
-/// Why there is no answer: nobody to ask, or nobody who serves the key, or none that may be asked.
-async fn nobody(session: &Session, key: &OwnedKeyExpr) -> Error {
+/// Error of a query without a reply: no connection, no service at the key, or none that this role may query.
+async fn no_reply(session: &Session, key: &OwnedKeyExpr) -> Error {
     let info = session.info();
     let connected = info.routers_zid().await.next().is_some() || info.peers_zid().await.next().is_some();
     if connected {
@@ -56,11 +56,11 @@ async fn nobody(session: &Session, key: &OwnedKeyExpr) -> Error {
     }
 }
 
-/// Asks, without a payload, for everything at a key, and awaits every answer, in the order they come; several services
-/// may give the same one. Nothing is no error.
+/// Queries a key without a payload and collects all answers, in order of arrival; several services may give the same one.
+/// No answer is no error.
 ///
 /// # Errors
-/// The first error that is answered; [`Code::DeadlineExceeded`] if the answers did not end in time;
+/// The first error among the answers; [`Code::DeadlineExceeded`] if the answers did not end in time;
 /// [`Code::ResourceExhausted`] if there are more than `limit`.
 pub async fn collect<R: Message>(
     session: &Session,
@@ -99,16 +99,16 @@ fn decode_reply<R: Message>(reply: Reply, key: &OwnedKeyExpr, timeout: Duration)
     }
 }
 
-/// The request in a query.
+/// Decodes the request in a query.
 ///
 /// # Errors
-/// If its payload is missing or wrong.
+/// If its payload is missing or invalid.
 pub fn request<Q: Message>(query: &Query) -> Result<Q, Error> {
     let payload = query.payload().ok_or_else(|| Error::missing("payload"))?;
     decode(&payload.to_bytes())
 }
 
-/// The span that sent a query, if it says so.
+/// W3C `traceparent` of the span that sent a query, if it carries one.
 pub fn traceparent(query: &Query) -> Option<String> {
     query.attachment().and_then(|attachment| attachment.try_to_string().ok().map(Into::into))
 }
@@ -121,8 +121,8 @@ pub fn reply<R: Message>(query: &Query, result: Result<R, Error>) -> zenoh::Resu
     reply_as(query, query.key_expr(), result)
 }
 
-/// Answers a query as the service at `key`, which a query to many has selected: answers under one key would be taken for
-/// versions of the same, of which the asker sees the last only.
+/// Answers a query to many services as the service at `key`: zenoh takes answers under one key for versions of one value, and
+/// delivers only the last.
 ///
 /// # Errors
 /// If zenoh cannot send it.
@@ -141,7 +141,7 @@ pub fn refuse(query: &Query, error: Error) -> zenoh::Result<()> {
     query.reply_err(proto::Error::from(error).encode_to_vec()).encoding(encoding::<proto::Error>()).wait()
 }
 
-/// Adds one of several answers to a query: the value that is at `key`, which the query's key must match.
+/// Adds one of several answers to a query: the value at `key`, which the query's key expression must match.
 ///
 /// # Errors
 /// If zenoh cannot send it.

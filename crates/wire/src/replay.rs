@@ -1,20 +1,20 @@
-//! What is known of an episode whose plans are recorded.
+//! Metadata of an episode with recorded plans.
 
 use crate::message::{digest, name, required};
 use crate::sim::Variation;
 use crate::{Error, Message, Observation, proto};
 use proto::planned_episode::Goal;
 
-/// An episode, without its plans: as their recording begins.
+/// Metadata of an episode with recorded plans: the header of the recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlannedEpisode {
-    /// What was to be solved.
+    /// Variation to solve.
     pub variation: Variation,
-    /// Name of the model that was asked.
+    /// Name of the model.
     pub model: String,
     /// SHA-256 of the checkpoint that answered, in hex.
     pub model_digest: String,
-    /// What was planned to; its digest is the goal id of requests.
+    /// Goal of all plans; its digest is the goal id of the requests.
     pub goal: Observation,
     /// Number of plans, at least 1.
     pub plans: u32,

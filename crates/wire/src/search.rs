@@ -1,35 +1,35 @@
-//! How a plan is searched for.
+//! Searches for plans.
 
 use crate::{Error, proto};
 
-/// Most iterations that can be asked for.
+/// Largest number of iterations in a request.
 const MAX_ITERATIONS: u32 = 1000;
-/// Most samples of a generation.
+/// Largest number of samples per iteration.
 const MAX_SAMPLES: u32 = 4096;
 
-/// A search for the actions whose predicted end is nearest to the goal.
+/// Search for the actions whose predicted last latent is nearest to the goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Search {
-    /// Which way.
+    /// Optimiser.
     pub solver: Solver,
-    /// Updates or generations; the default if none.
+    /// Iterations: gradient updates, or generations of samples; the model's default if none.
     pub iterations: Option<u32>,
-    /// Plans in each generation; the default if none.
+    /// Sampled plans per iteration; the default if none.
     pub samples: Option<u32>,
-    /// Whether to go on for as long as the deadline allows.
+    /// Anytime search: iterate until shortly before the deadline.
     pub anytime: bool,
 }
 
-/// Ways to search.
+/// Optimisers of plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Solver {
-    /// Backpropagation through the predicted states.
+    /// Gradient-based shooting: backpropagation through the predicted latents.
     Gradient,
-    /// The cross-entropy method.
+    /// Cross-entropy method.
     Cem,
     /// Model predictive path integral control.
     Mppi,
-    /// CEM whose mean takes a step down the gradient after each generation.
+    /// CEM with a gradient step of the mean after each iteration.
     Hybrid,
 }
 
@@ -75,7 +75,7 @@ impl From<Search> for proto::Search {
     }
 }
 
-/// A number, none if it is 0.
+/// Validates a number with an upper bound; 0 stands for none.
 fn at_most(field: &str, most: u32, value: u32) -> Result<Option<u32>, Error> {
     if value > most {
         return Err(Error::invalid(field, format!("at most {most}"), value));

@@ -1,58 +1,58 @@
-//! Requests to a simulator worker and its answers.
+//! Requests and responses of a simulator worker.
 
 use crate::message::{action, required};
 use crate::{Error, Image, Message, Position, proto};
 
-/// The randomised object positions of an episode.
+/// Randomised initial state of an episode.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Variation {
     /// Name of the task.
     pub task: String,
-    /// What the positions are drawn from.
+    /// Seed of the positions of objects and goal.
     pub seed: u64,
 }
 
-/// Starts an episode.
+/// Request to start an episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResetRequest {
-    /// Which one.
+    /// Variation to start.
     pub variation: Variation,
-    /// Seed of the variation whose goal is shown, if not its own: an ablation.
+    /// Seed of the variation that the goal is taken from; that of `variation` if none. Any other is an ablation.
     pub goal_seed: Option<u64>,
 }
 
-/// A started episode.
+/// Started episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResetResponse {
-    /// Names the episode in every following step.
+    /// Identifier of the episode in its step requests.
     pub episode_id: String,
-    /// Last frame of an expert run of the same variation.
+    /// Last frame of an expert episode of the same variation.
     pub goal: Image,
     /// First frame.
     pub observation: Image,
-    /// The episode ends after this many steps at the latest.
+    /// Step limit of the episode.
     pub max_steps: u32,
-    /// Where the goal is, if it is a position.
+    /// Goal position, if the goal is one.
     pub goal_position: Option<Position>,
-    /// Where the hand is, if the goal is a position.
+    /// Position of the hand, if the goal is a position.
     pub hand_position: Option<Position>,
 }
 
-/// Applies one action, exactly once.
+/// Request to apply one action, exactly once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepRequest {
-    /// The episode.
+    /// Identifier of the episode.
     pub episode_id: String,
-    /// Steps applied before this one.
+    /// Number of steps applied before this one.
     pub step: u32,
-    /// Each value in [-1, 1].
+    /// Action, each value in [-1, 1].
     pub action: Vec<f32>,
 }
 
-/// What an action led to.
+/// Outcome of an action.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepResponse {
-    /// The frame after the action.
+    /// Frame after the action.
     pub observation: Image,
     /// Meta-World's reward.
     pub reward: f64,
@@ -60,7 +60,7 @@ pub struct StepResponse {
     pub success: bool,
     /// Whether the episode is over.
     pub done: bool,
-    /// Where the hand is after the action, if the goal is a position.
+    /// Position of the hand after the action, if the goal is a position.
     pub hand_position: Option<Position>,
 }
 
@@ -180,7 +180,7 @@ impl From<StepResponse> for proto::StepResponse {
     }
 }
 
-/// A position, or none for no values.
+/// Validates a position x, y, z in metres, or no values for none.
 fn position(field: &str, values: &[f32]) -> Result<Option<Position>, Error> {
     match *values {
         [] => Ok(None),

@@ -1,4 +1,4 @@
-//! Traces that cross processes: a request carries the W3C `traceparent` of the span that sent it, over zenoh as the attachment
+//! Trace context propagation: a request carries the W3C `traceparent` of the span that sent it, over zenoh as the attachment
 //! and over gRPC as a header.
 
 use opentelemetry::global;
@@ -6,17 +6,17 @@ use std::collections::HashMap;
 use tracing::Span;
 use tracing_opentelemetry::OpenTelemetrySpanExt;
 
-/// Name of the header, and of the one field that the trace context propagator knows.
+/// Name of the header, and of the propagator's only field.
 pub const TRACEPARENT: &str = "traceparent";
 
-/// The current span, for a request to carry; none if nothing is traced.
+/// W3C `traceparent` of the current span; none if tracing is off.
 pub fn traceparent() -> Option<String> {
     let mut fields = HashMap::new();
     global::get_text_map_propagator(|propagator| propagator.inject_context(&Span::current().context(), &mut fields));
     fields.remove(TRACEPARENT)
 }
 
-/// Makes a span the child of the one that a request carries. What is no `traceparent` begins a trace of its own.
+/// Makes a span the child of a request's span. Without a valid `traceparent` the span starts a trace of its own.
 pub fn follow(span: &Span, traceparent: Option<&str>) {
     if let Some(traceparent) = traceparent {
         let fields = HashMap::from([(TRACEPARENT.to_owned(), traceparent.to_owned())]);

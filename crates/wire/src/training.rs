@@ -4,62 +4,62 @@ use crate::message::{digest, name, required};
 use crate::{Error, Message, proto};
 use serde::{Deserialize, Serialize};
 
-/// Most tasks that are held out.
+/// Largest number of held-out tasks.
 const MAX_TASKS: usize = 1000;
 /// Longest settings, in bytes.
 const MAX_SETTINGS_BYTES: usize = 16 << 10;
 /// Longest reason of a failure, in bytes.
 pub const MAX_REASON_BYTES: usize = 2000;
-/// Most runs that are listed.
+/// Largest number of runs in a list.
 pub const MAX_RUNS: usize = 1000;
 
-/// How far a run is after a step.
+/// Progress of a run after a step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Steps done.
     pub step: u64,
     /// Steps of the whole run, at least 1.
     pub steps: u64,
-    /// Passes over every sample that are complete.
+    /// Epochs completed: passes over all samples.
     pub epoch: u64,
-    /// Passes of the whole run.
+    /// Epochs of the whole run.
     pub epochs: u64,
-    /// Samples that were trained on, counted once for each pass.
+    /// Samples trained on, counted once per epoch.
     pub samples: u64,
     /// Running mean of the outer loss.
     pub loss: f64,
     /// Learning rate of the step.
     pub learning_rate: f64,
-    /// Norm of the gradient over all weights, before it was clipped.
+    /// Norm of the gradient over all weights, before clipping.
     pub gradient_norm: f64,
-    /// Samples a second, since the process of the run began.
+    /// Throughput since the start of the run's process, in samples per second.
     pub samples_per_second: f64,
 }
 
-/// Whether a run runs, and how it ended if not.
+/// State of a training run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "state")]
 pub enum RunState {
-    /// It trains.
+    /// Training.
     Running,
-    /// The checkpoint is written.
+    /// Finished; the checkpoint is written.
     Finished {
         /// SHA-256 of the checkpoint, in hex.
         digest: String,
     },
-    /// Stopped by request; it can be taken up.
+    /// Stopped by request; can be resumed.
     Stopped,
-    /// Failed; it can be taken up.
+    /// Failed; can be resumed.
     Failed {
-        /// Its last lines.
+        /// Exit status and end of the log.
         reason: String,
     },
-    /// Ended with the service that had started it; it can be taken up.
+    /// Ended with the service that had started it; can be resumed.
     Interrupted,
 }
 
 impl RunState {
-    /// The state's name.
+    /// Name of the state.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Running => "running",
@@ -71,26 +71,26 @@ impl RunState {
     }
 }
 
-/// A training run.
+/// Training run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
-    /// Its name.
+    /// Name of the run.
     pub name: String,
-    /// Whether it runs.
+    /// State of the run.
     #[serde(flatten)]
     pub state: RunState,
-    /// How far it is; none before the first step.
+    /// Progress; none before the first step.
     pub progress: Option<Progress>,
 }
 
-/// Asks for a run.
+/// Request to start a run, or to resume one that stopped, failed or was interrupted.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct StartRunRequest {
-    /// Names the run, its folder and its checkpoint.
+    /// Name of the run, its folder and its checkpoint.
     pub name: String,
-    /// Where the settings start from.
+    /// Preset that the settings start from.
     pub preset: Option<String>,
-    /// Tasks that the model must not see.
+    /// Held-out tasks, whose demonstrations are not trained on.
     pub hold_out: Vec<String>,
     /// Seed of initialisation and sampling.
     pub seed: Option<u64>,
@@ -98,49 +98,49 @@ pub struct StartRunRequest {
     pub settings: String,
 }
 
-/// The run that was started.
+/// Started run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StartRunResponse {
-    /// As it is now.
+    /// The run as of now.
     pub run: Run,
 }
 
-/// Asks a run to end.
+/// Request to stop a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StopRunRequest {
-    /// Which run.
+    /// Name of the run.
     pub name: String,
 }
 
-/// The run that ended.
+/// Stopped run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StopRunResponse {
-    /// As it is now.
+    /// The run as of now.
     pub run: Run,
 }
 
-/// Asks for every run.
+/// Request for all runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ListRunsRequest;
 
-/// Every run.
+/// All runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ListRunsResponse {
-    /// By name.
+    /// Runs, ordered by name.
     pub runs: Vec<Run>,
 }
 
-/// Asks how a run is from now on.
+/// Request for a run's state now and at each change.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WatchRunRequest {
-    /// Which run.
+    /// Name of the run.
     pub name: String,
 }
 
-/// How a run is.
+/// State of a watched run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WatchRunResponse {
-    /// As it is now.
+    /// The run as of now.
     pub run: Run,
 }
 
@@ -284,7 +284,7 @@ impl From<ListRunsResponse> for proto::ListRunsResponse {
     }
 }
 
-/// Messages that hold one run, or name one.
+/// Implements the conversions of messages with a single field: a run, or its name.
 macro_rules! of_one_run {
     ($field:ident, $read:expr, $write:expr; $($message:ident),+) => {$(
         impl Message for $message {

@@ -1,4 +1,4 @@
-//! Digests that two languages must agree on, and those that tell pictures apart.
+//! Digests: agreement with the Python package, and sensitivity to every part.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -23,14 +23,14 @@ fn steps() -> Vec<DemonstrationStep> {
 }
 
 #[test]
-fn the_digest_of_an_episode_is_the_one_agreed_upon() {
+fn the_digest_of_an_episode_matches_the_golden_one() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/episode_digest.json");
     let golden: serde_json::Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
     assert_eq!(digest(&steps()), golden["digest"]);
 }
 
 #[test]
-fn every_part_of_a_step_counts() {
+fn the_digest_depends_on_every_part_of_a_step() {
     let whole = digest(&steps());
     let spoils: [fn(&mut DemonstrationStep); 5] = [
         |step| step.frame = Image::new(84, 84, vec![0; 84 * 84 * 3]).unwrap(),
@@ -46,7 +46,7 @@ fn every_part_of_a_step_counts() {
     }
 }
 
-/// Protobuf keeps no sign of a zero, so the digest must not either.
+/// Protobuf drops the sign of a zero, so the digest must ignore it.
 #[test]
 fn a_reward_of_minus_zero_is_zero() {
     let [whole, mut negative] = [steps(), steps()];

@@ -1,4 +1,4 @@
-//! The keys are those of `tests/golden/keys.json`, to which the Python package is held too.
+//! Keys against `tests/golden/keys.json`, which the Python package is tested against too.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use wire::key;
 
 #[test]
-fn keys_are_the_ones_agreed_upon() {
+fn keys_match_the_golden_ones() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/keys.json");
     let golden: BTreeMap<String, Value> = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
     for (name, entry) in &golden {
@@ -45,7 +45,7 @@ fn keys_are_the_ones_agreed_upon() {
 }
 
 #[test]
-fn a_name_that_is_no_chunk_is_refused() {
+fn a_name_that_is_not_a_chunk_is_refused() {
     let error = key::planner_plan("a/b").unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("planner_plan", "\"a/b\""));
 }

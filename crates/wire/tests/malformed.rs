@@ -1,4 +1,4 @@
-//! Wrong messages are refused with the field at fault, what was expected and what came.
+//! Refusals of invalid messages name the field at fault, what was expected and what came.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -25,7 +25,7 @@ fn plan_request() -> proto::PlanRequest {
     }
 }
 
-/// Decodes a plan request that `spoil` has made wrong.
+/// Decodes a plan request that `spoil` has made invalid.
 fn refusal(spoil: impl FnOnce(&mut proto::PlanRequest)) -> Error {
     let mut request = plan_request();
     spoil(&mut request);
@@ -40,7 +40,7 @@ fn image_of(request: &mut proto::PlanRequest) -> &mut proto::Image {
 }
 
 #[test]
-fn the_unspoiled_request_is_fine() {
+fn the_valid_request_is_decoded() {
     decode::<PlanRequest>(&plan_request().encode_to_vec()).unwrap();
 }
 
@@ -116,7 +116,7 @@ fn a_truncated_message_is_refused() {
 }
 
 #[test]
-fn an_endless_message_is_refused_unread() {
+fn an_oversized_message_is_refused_undecoded() {
     let error = decode::<PlanRequest>(&vec![0; (1 << 20) + 1]).unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("payload", "1048577 bytes"));
 }

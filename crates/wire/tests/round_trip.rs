@@ -1,4 +1,4 @@
-//! Every message survives the trip to bytes and back, and no bytes make a decoder panic.
+//! Round trip of every message through its encoding, and decoders on arbitrary bytes.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -141,7 +141,7 @@ proptest! {
         search in option::of(search()),
         warm_start in vec(action(), 0..6),
     ) {
-        // A search that goes on until the deadline needs one.
+        // An anytime search needs a deadline.
         let deadline = deadline.or_else(|| search?.anytime.then_some(Duration::from_millis(1)));
         survives(PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start });
     }

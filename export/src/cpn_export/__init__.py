@@ -1,1 +1,1 @@
-"""Recorded demonstrations as datasets of other robot-learning tools."""
+"""Export of recorded demonstrations to the dataset formats of other robot-learning tools."""

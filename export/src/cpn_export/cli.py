@@ -1,4 +1,4 @@
-"""The command line."""
+"""Command line of the export."""
 
 import sys
 import warnings
@@ -35,7 +35,7 @@ def lerobot() -> None:
     warnings.filterwarnings("ignore", "Converting input from bool")  # LeRobot's statistics of next.success.
     try:
         recordings = select_recordings(config.dataset, config.tasks, config.episodes)
-        # Imported this late because it takes ten seconds, which a wrong option should not cost.
+        # Imported late: it takes ten seconds, and wrong options should fail at once.
         from cpn_export.lerobot_dataset import write_dataset
 
         write_dataset(recordings, config.out)

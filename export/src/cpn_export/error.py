@@ -1,5 +1,5 @@
-"""The error of this package."""
+"""Error of this package."""
 
 
 class ExportError(Exception):
-    """Why nothing was exported: the file or the option, what was expected and what came."""
+    """Failed export; the message names the file or option, what was expected and what came."""

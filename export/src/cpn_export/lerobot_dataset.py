@@ -1,4 +1,4 @@
-"""Writes recordings as a LeRobotDataset v3."""
+"""Export of recordings as a LeRobotDataset v3."""
 
 import io
 import json
@@ -21,7 +21,7 @@ from cpn_export.recording import Episode, Header, read_episode
 from cpn_export.workshop import workshop
 
 ARM_STATE = ("hand_x", "hand_y", "hand_z", "gripper")
-"""What the simulators' states begin with."""
+"""First values of the simulators' states."""
 
 DESCRIPTION = """\
 Demonstrations of a scripted expert. `goals/episode-*.png` are the pictures of the finished tasks, one an episode: the
@@ -30,10 +30,10 @@ was, its task, seed, goal position and digest; `render_spec` in `meta/info.json`
 
 
 def write_dataset(recordings: Sequence[Header], out: Path) -> None:
-    """Writes `recordings`, one or more that are alike, as a dataset at `out`; it appears whole or not at all.
+    """Writes `recordings`, at least one, as a dataset at `out`, atomically.
 
     Raises:
-        ExportError: If `out` exists or cannot be written, or a recording is faulty or of other sizes than the first.
+        ExportError: If `out` exists or cannot be written, or a recording is faulty or differs in sizes from the first.
     """
     if os.path.lexists(out):
         raise ExportError(f"out: expected a path where nothing is yet, got {out}")
@@ -42,18 +42,18 @@ def write_dataset(recordings: Sequence[Header], out: Path) -> None:
         with workshop(out) as folder:
             partial = folder / out.name
             _write(recordings, partial)
-            # An empty folder that came meanwhile would be replaced without a word.
+            # Checked again, since the rename would silently replace an empty folder created meanwhile.
             if os.path.lexists(out):
                 raise ExportError(f"out: expected a path where nothing is yet, got {out}")
             partial.rename(out)
     except OSError as error:
-        # Libraries word the same fault in their own ways.
+        # The system's text, since libraries word the same error differently.
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise ExportError(f"out: expected room for a dataset at {out}, got {reason}") from error
 
 
 def features(episode: Episode) -> dict[str, dict[str, Any]]:
-    """The features of a dataset of episodes like this one, as LeRobot wants them."""
+    """LeRobot features of a dataset of episodes with the shapes of this one."""
     height, width, channels = episode.frames.shape[1:]
     return {
         # PNG instead of video: lossless, and at 84 x 84 small enough.
@@ -71,9 +71,10 @@ def features(episode: Episode) -> dict[str, dict[str, Any]]:
 
 
 def _write(recordings: Sequence[Header], root: Path) -> None:
-    datasets.disable_progress_bars()  # Its own on every episode, beside the one of all episodes.
+    datasets.disable_progress_bars()  # One per episode, besides the bar of all episodes.
     dataset = _create(recordings[0], root)
     provenance: list[dict[str, Any]] = []
+
     try:
         for index, header in enumerate(tqdm(recordings, unit="episode")):
             episode = read_episode(header)
@@ -86,8 +87,9 @@ def _write(recordings: Sequence[Header], root: Path) -> None:
             Image.fromarray(episode.frames[-1]).save(root / goal)
             provenance.append(_provenance(index, header, goal))
     finally:
-        dataset.finalize()  # Even after an error: its destructor would, and write files anew.
-    shutil.rmtree(root / "images", ignore_errors=True)  # Where LeRobot keeps frames until they are in a Parquet file.
+        dataset.finalize()  # Even after an error: its destructor would do so, and write files again.
+
+    shutil.rmtree(root / "images", ignore_errors=True)  # LeRobot's frames before they are in a Parquet file.
     (root / "meta" / "recordings.json").write_text(json.dumps(provenance, indent=2) + "\n")
     card = create_lerobot_dataset_card(dataset_info=dataset.meta.info, dataset_description=DESCRIPTION)
     card.save(root / "README.md")
@@ -105,7 +107,7 @@ def _create(first: Header, root: Path) -> LeRobotDataset:
         fps=int(first.control_hz),
         features=features(episode),
         use_videos=False,
-        video_backend="pyav",  # Not used, but without a name LeRobot warns that it misses torchcodec.
+        video_backend="pyav",  # Unused, but without it LeRobot warns that torchcodec is missing.
     )
     dataset.meta.info["render_spec"] = first.render_spec
     (root / "goals").mkdir()
@@ -113,7 +115,7 @@ def _create(first: Header, root: Path) -> LeRobotDataset:
 
 
 def _add(dataset: LeRobotDataset, header: Header, episode: Episode) -> None:
-    """Adds the T rows of an episode; row t holds what its action led to, which the recording keeps at step t + 1."""
+    """Adds the T rows of an episode; reward and success of row t are those of the recording's step t + 1."""
     for t, action in enumerate(episode.actions):
         row = {
             "observation.image": episode.frames[t],
@@ -124,11 +126,11 @@ def _add(dataset: LeRobotDataset, header: Header, episode: Episode) -> None:
             "next.success": episode.successes[t + 1, np.newaxis],
             "task": header.task,
         }
-        # LeRobot prints what keeps it from writing a picture, and goes on without.
-        with redirect_stdout(io.StringIO()) as said:
+        # LeRobot only prints an error of writing an image, and continues.
+        with redirect_stdout(io.StringIO()) as printed:
             dataset.add_frame(row)
         if not Path((dataset.episode_buffer or {})["observation.image"][t]).exists():
-            raise OSError(said.getvalue().strip())
+            raise OSError(printed.getvalue().strip())
 
 
 def _provenance(index: int, header: Header, goal: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Reads recordings: MCAP files of one episode each, as `proto/cpn/v1/demonstration.proto` describes them."""
+"""Reader of recordings: MCAP files of one episode each, as `proto/cpn/v1/demonstration.proto` describes them."""
 
 import hashlib
 import math
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cpn_export.error import ExportError
 
 MIN_STEPS = 2
-"""One with an action and the goal frame."""
+"""Fewest steps of an episode: one with an action, and the goal frame."""
 
 EPISODE, CAMERA, STEP = "/episode", "/camera", "/step"
 SCHEMAS = {EPISODE: "cpn.v1.RecordedEpisode", CAMERA: "foxglove.RawImage", STEP: "cpn.v1.RecordedStep"}
@@ -25,18 +25,18 @@ SCHEMAS = {EPISODE: "cpn.v1.RecordedEpisode", CAMERA: "foxglove.RawImage", STEP:
 
 @dataclass(frozen=True)
 class Header:
-    """What a recording says of itself before its first step."""
+    """Header of a recording: the metadata of its episode."""
 
     path: Path
     episode_id: str
     task: str
     seed: int
     render_spec: str
-    """How its frames were rendered, in JSON."""
+    """Render spec of the frames, in JSON."""
     goal_position: tuple[float, ...]
-    """In metres; empty for a task whose goal is no position."""
+    """Goal position in metres; empty if the goal is no position."""
     steps: int
-    """T + 1, the goal frame included."""
+    """Number of steps T + 1, goal frame included."""
     digest: str
     """SHA-256 over the steps, in hex."""
     control_hz: float
@@ -44,7 +44,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Episode:
-    """The T + 1 steps of a recording; the last shows the goal and has no action."""
+    """Episode of T + 1 steps; the last is the goal frame, without an action."""
 
     frames: NDArray[np.uint8]
     """[T + 1, height, width, 3], RGB, rows from the top."""
@@ -53,16 +53,16 @@ class Episode:
     states: NDArray[np.float32]
     """[T + 1, S]."""
     rewards: NDArray[np.float32]
-    """[T + 1]: what the action before each step brought."""
+    """[T + 1], reward of the action before each step."""
     successes: NDArray[np.bool_]
-    """[T + 1]: whether the task is solved at each step."""
+    """[T + 1], whether the task is solved at each step."""
 
 
 def read_header(path: Path) -> Header:
-    """Reads the header of a recording, and only that.
+    """Reads only the header of a recording.
 
     Raises:
-        ExportError: If the file is no recording.
+        ExportError: If the file is not a recording.
     """
     with _reading(path):
         for _, _, message in _messages(path, [EPISODE]):
@@ -84,7 +84,7 @@ def read_episode(header: Header) -> Episode:
     """Reads and checks the steps of the recording that `header` was read from.
 
     Raises:
-        ExportError: If the file is corrupt, or its steps are not what the header says.
+        ExportError: If the file is corrupt, or its steps do not match the header.
     """
     path = header.path
     with _reading(path):
@@ -106,7 +106,7 @@ def read_episode(header: Header) -> Episode:
         _check(path, "actions", len(steps) - 1, sum(step.HasField("action") for step in steps))
         _check(path, "action of the goal frame", False, steps[-1].HasField("action"))
         for number, step in enumerate(steps):
-            # Written so that NaN, which compares false with everything, is refused too.
+            # In this form NaN, which compares false with everything, is refused too.
             if not all(abs(value) <= 1 for value in step.action.values):
                 got = list(step.action.values)
                 raise ExportError(f"{path}: action of step {number}: expected values in [-1, 1], got {got}")
@@ -122,12 +122,12 @@ def read_episode(header: Header) -> Episode:
 
 
 def _log_time(step: int, header: Header) -> int:
-    """When a step is, in nanoseconds since the start of the episode."""
+    """Time of a step, in nanoseconds since the start of the episode."""
     return math.floor(step * 1e9 / header.control_hz + 0.5)
 
 
 def _digest(images: Sequence[Any], steps: Sequence[Any]) -> str:
-    """As `RecordedEpisode.digest` in `proto/cpn/v1/demonstration.proto` has it."""
+    """SHA-256 of the steps, in hex, as `RecordedEpisode.digest` in `proto/cpn/v1/demonstration.proto` defines it."""
     digest = hashlib.sha256()
     for image, step in zip(images, steps, strict=True):
         digest.update(image.data)
@@ -143,9 +143,9 @@ def _check(path: Path, what: str, expected: object, got: object) -> None:
 
 
 def _messages(path: Path, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
-    """Topic, log time in nanoseconds and decoded message of each message at `topics`, in the order of the file."""
+    """Topic, log time in nanoseconds and decoded content of each message at `topics`, in the order of the file."""
     with path.open("rb") as stream:
-        # Not the seeking one: it takes the schemas from the file's summary, which no checksum that it checks covers.
+        # The seeking reader takes schemas from the file's summary, whose checksum it does not verify.
         reader = NonSeekingReader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         for schema, channel, message, decoded in reader.iter_decoded_messages(topics=topics, log_time_order=False):
             _check(path, f"schema of {channel.topic}", SCHEMAS[channel.topic], schema.name if schema else None)
@@ -158,5 +158,5 @@ def _reading(path: Path) -> Iterator[None]:
         yield
     except ExportError:
         raise
-    except Exception as error:  # What is corrupt surfaces as whatever the layer that meets it raises: zstd, struct, ...
+    except Exception as error:  # A corrupt file raises errors of several layers: zstd, struct, ...
         raise ExportError(f"{path}: corrupt, or not a recording: {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Chooses the recordings that make a dataset."""
+"""Selection of the recordings of a dataset."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,16 +8,16 @@ from cpn_export.recording import Header, read_header
 
 
 def select_recordings(dataset: Path, tasks: Sequence[str] = (), episodes: int | None = None) -> list[Header]:
-    """The recordings of `dataset` that go together, by task and seed.
+    """Selected recordings of `dataset`, ordered by task and seed.
 
     Args:
         dataset: Folder with a folder of recordings for each task.
-        tasks: Which tasks, in this order; all of them if empty.
-        episodes: How many of each task, lowest seeds first; all of them if None.
+        tasks: Tasks to select, in this order; all tasks if empty.
+        episodes: Number of episodes per task, lowest seeds first; all episodes if None.
 
     Raises:
-        ExportError: If a task is unknown, recordings are missing, not where they belong or there twice, or differ in
-            what a dataset has only one of.
+        ExportError: If a task is unknown, there are too few recordings, one is misplaced or duplicate, or they differ
+            in control rate or render spec.
     """
     if not dataset.is_dir():
         raise ExportError(f"dataset: expected a folder, got {dataset}")
@@ -27,6 +27,7 @@ def select_recordings(dataset: Path, tasks: Sequence[str] = (), episodes: int | 
     for task in tasks:
         if task not in known:
             raise ExportError(f"tasks: expected some of {', '.join(known)}, got {task}")
+
     chosen: list[Header] = []
     for task in dict.fromkeys(tasks or known):
         headers = sorted(
@@ -35,18 +36,19 @@ def select_recordings(dataset: Path, tasks: Sequence[str] = (), episodes: int | 
         if episodes is not None and len(headers) < episodes:
             raise ExportError(f"episodes: expected {episodes} recordings of {task}, got {len(headers)}")
         chosen += headers[:episodes]
+
     _check_distinct(chosen)
     _check_alike(chosen)
     return chosen
 
 
 def _paths(folder: Path) -> list[Path]:
-    """The recordings in the folder of a task, by name."""
+    """Recordings in the folder of a task, ordered by name."""
     return [folder / name for name in _names(folder, lambda path: path.suffix == ".mcap")]
 
 
 def _names(folder: Path, wanted: Callable[[Path], bool]) -> list[str]:
-    """Names in a folder, in order. Those that begin with a dot are nobody's: file systems and desktops leave them."""
+    """Names in a folder, ordered, without those that begin with a dot, which file systems and desktops leave behind."""
     try:
         return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and wanted(path))
     except OSError as error:
@@ -54,7 +56,7 @@ def _names(folder: Path, wanted: Callable[[Path], bool]) -> list[str]:
 
 
 def _read_header(dataset: Path, path: Path) -> Header:
-    """Reads a header, which must be that of the recording that belongs there: a copy elsewhere is none of its own."""
+    """Reads the header of a recording, whose path must agree with it: a misplaced file is a copy of another's."""
     header = read_header(path)
     expected = dataset / header.task / f"{header.episode_id}.mcap"
     if path != expected:
@@ -65,7 +67,7 @@ def _read_header(dataset: Path, path: Path) -> Header:
 def _check_distinct(headers: Sequence[Header]) -> None:
     paths: dict[str, Path] = {}
     for header in headers:
-        # By digest too: under another name it is still the same episode.
+        # Also by digest, since the same episode may have been copied under another id.
         for field in ("episode_id", "digest"):
             value = getattr(header, field)
             if (other := paths.setdefault(f"{field} {value}", header.path)) != header.path:

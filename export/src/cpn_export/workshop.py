@@ -1,4 +1,4 @@
-"""Folders for datasets in the making."""
+"""Temporary folders for unfinished datasets."""
 
 import fcntl
 import glob
@@ -10,24 +10,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 MARK = ".cpn-export"
-"""File in each of our folders, locked as long as the run that made it lives."""
+"""Marker file in each temporary folder, locked while its run lives."""
 
 
 @contextmanager
 def workshop(out: Path) -> Iterator[Path]:
-    """A new folder beside `out`, which goes away in the end; those of runs that were killed go first.
+    """Temporary folder beside `out`, removed at the end; folders of killed runs are removed first.
 
     Raises:
-        OSError: If none can be made.
+        OSError: If the folder cannot be created.
     """
     _clear(out)
     folder = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
         with (folder / f"{MARK}.new").open("w") as mark:
-            # Some network file systems have no locks: what a killed run leaves there, stays there.
+            # Without locks, as on some network file systems, folders of killed runs stay.
             with suppress(OSError):
                 fcntl.flock(mark, fcntl.LOCK_EX)
-                # Only now: another run takes a mark without a lock for one of a dead run.
+                # Renamed only once locked, since other runs take an unlocked marker for that of a killed run.
                 os.rename(mark.name, folder / MARK)
             yield folder
     finally:
@@ -36,7 +36,7 @@ def workshop(out: Path) -> Iterator[Path]:
 
 def _clear(out: Path) -> None:
     for folder in out.parent.glob(f".{glob.escape(out.name)}.*.partial"):
-        # Without our mark it is not ours, and with a lock another run is at work in it.
+        # A folder without the marker is not ours; one with a locked marker is in use.
         with suppress(OSError), (folder / MARK).open("r+") as mark:
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(folder, ignore_errors=True)

@@ -1,7 +1,7 @@
-//! Issuing, renewing and revoking certificates.
+//! Certificate authority: issues, renews and revokes certificates.
 //!
 //! ```text
-//! FOLDER/authority/    the authority's key, certificate and list of identities: stays where it is
+//! FOLDER/authority/    key, certificate and list of identities of the authority: never distributed
 //! FOLDER/IDENTITY/     ca.pem, certificate.pem, private-key.pem, crl.pem: for the process of that identity
 //! FOLDER/ROUTER/       the same, and router.json5 for zenohd
 //! ```
@@ -20,18 +20,18 @@ use std::path::{Path, PathBuf};
 use time::{Duration, OffsetDateTime};
 use wire::access::Role;
 
-/// Folder of the authority.
+/// Name of the authority's own folder.
 pub(crate) const AUTHORITY: &str = "authority";
-/// Lifetime of the authority.
+/// Lifetime of the authority's certificate, in days.
 const CA_DAYS: i64 = 3650;
-/// Time by which clocks may differ.
+/// Tolerated clock skew.
 const CLOCK_SKEW: Duration = Duration::minutes(5);
-/// Hosts of every certificate, beside those that are asked for.
+/// Host names in every certificate, besides the requested ones.
 const LOCAL_HOSTS: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
-/// Largest file that is read.
+/// Largest file of the authority, in bytes.
 const MAX_BYTES: usize = 16 << 20;
 
-/// A certificate authority in a folder, which no other process changes as long as this lives.
+/// Certificate authority in a folder, locked against other processes.
 #[derive(Debug)]
 pub struct Authority {
     folder: PathBuf,
@@ -43,10 +43,10 @@ pub struct Authority {
 }
 
 impl Authority {
-    /// Opens the authority of a folder; makes one if there is none. Certificates are issued for so many days.
+    /// Opens the authority of a folder, or creates one if there is none. New certificates are valid for `days` days.
     ///
     /// # Errors
-    /// If the folder cannot be used, another process has it, or a file in it is malformed.
+    /// If the folder cannot be read or written, another process has it, or a file in it is malformed.
     pub fn open(folder: &Path, days: u16) -> anyhow::Result<Self> {
         let own = folder.join(AUTHORITY);
         let lock = files::take_over(&own)?;
@@ -56,6 +56,7 @@ impl Authority {
             files::write_secret(&key, private_key.as_bytes())?;
             files::write_atomically(&ca, certificate.as_bytes())?;
         }
+
         let read = |path: &Path| {
             let bytes = files::read_all(path, MAX_BYTES).with_context(|| path.display().to_string())?;
             String::from_utf8(bytes).with_context(|| path.display().to_string())
@@ -63,6 +64,7 @@ impl Authority {
         let key_pair = KeyPair::from_pem(&read(&key)?).with_context(|| key.display().to_string())?;
         let ca_pem = read(&ca)?;
         let issuer = Issuer::from_ca_cert_pem(&ca_pem, key_pair).with_context(|| ca.display().to_string())?;
+
         let list = own.join("identities.json");
         let identities = if list.exists() {
             serde_json::from_str(&read(&list)?).with_context(|| list.display().to_string())?
@@ -73,13 +75,13 @@ impl Authority {
         Ok(Self { folder: folder.to_owned(), ca: ca_pem, issuer, identities, lifetime, _lock: lock })
     }
 
-    /// Everybody that is known.
+    /// Known identities.
     pub fn identities(&self) -> &Identities {
         &self.identities
     }
 
-    /// One identity for each role, with the hosts, where there is none yet; renews what expires soon. The router lets keys
-    /// through below these `namespaces`, or without a prefix if there is none.
+    /// Issues a certificate with the hosts for each role that has none, and renews certificates that expire soon. The router
+    /// admits keys below these `namespaces`, or without a prefix if there is none.
     ///
     /// # Errors
     /// If a host is malformed, or a file cannot be written.
@@ -95,7 +97,7 @@ impl Authority {
         self.renew(&[])
     }
 
-    /// A certificate for an identity, `ROLE` or `ROLE.NAME`, beside those that it has.
+    /// Issues a certificate to an identity, `ROLE` or `ROLE.NAME`; its earlier ones stay valid.
     ///
     /// # Errors
     /// If the identity or a host is malformed, the identity was revoked, or a file cannot be written.
@@ -104,10 +106,10 @@ impl Authority {
         self.write_shared()
     }
 
-    /// New certificates for these identities, or, if none is named, for all of which less than a third of the time is left.
+    /// Renews the certificates of these identities, or, if none is named, all with less than a third of their lifetime left.
     ///
     /// # Errors
-    /// If an identity is not known or was revoked, or a file cannot be written.
+    /// If an identity is unknown or was revoked, or a file cannot be written.
     pub fn renew(&mut self, names: &[String]) -> anyhow::Result<()> {
         let now = OffsetDateTime::now_utc();
         for name in names {
@@ -123,10 +125,11 @@ impl Authority {
         self.write_shared()
     }
 
-    /// Revokes an identity, for good: all its certificates go on the revocation list, and no router lists it.
+    /// Revokes an identity for good: puts all its certificates on the revocation list, and removes it from the routers'
+    /// configuration.
     ///
     /// # Errors
-    /// If it is not known, or a file cannot be written.
+    /// If the identity is unknown, or a file cannot be written.
     pub fn revoke(&mut self, name: &str) -> anyhow::Result<()> {
         let identity = self.identities.identities.get_mut(name);
         let identity = identity.with_context(|| format!("identity: expected one that is known, got {name}"))?;
@@ -144,6 +147,7 @@ impl Authority {
         let known = self.identities.identities.get(name);
         let revoked = known.is_some_and(|identity| identity.revoked.is_some());
         ensure!(!revoked, "identity: expected one that was not revoked, got {name}");
+
         let mut hosts = hosts.clone();
         let role = Role::of(name).map(Role::name);
         hosts.extend(LOCAL_HOSTS.into_iter().chain(role).map(str::to_owned));
@@ -155,7 +159,7 @@ impl Authority {
         (params.not_before, params.not_after) = (now - CLOCK_SKEW, now + self.lifetime);
         params.distinguished_name = rcgen::DistinguishedName::new();
         params.distinguished_name.push(DnType::CommonName, name);
-        // Positive, as RFC 5280 wants it.
+        // Positive, as RFC 5280 requires.
         let serial = [&[1][..], &serial].concat();
         params.serial_number = Some(SerialNumber::from_slice(&serial));
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
@@ -169,8 +173,9 @@ impl Authority {
         let (not_before, not_after) = (params.not_before, params.not_after);
         let identity = Identity { hosts, serials, not_before, not_after, revoked: None };
         self.identities.identities.insert(name.to_owned(), identity);
-        // Before the certificate is, so that none is out there that cannot be revoked.
+        // Before the certificate is written, so that every certificate in use can be revoked.
         self.write_identities()?;
+
         let folder = self.folder(name);
         files::write_secret(&folder.join("private-key.pem"), key.serialize_pem().as_bytes())?;
         files::write_atomically(&folder.join("certificate.pem"), certificate.pem().as_bytes())?;
@@ -182,7 +187,7 @@ impl Authority {
         files::write_atomically(&self.folder.join(AUTHORITY).join("identities.json"), &list)
     }
 
-    /// What follows from the list of identities: the revocation list, and the routers' configuration.
+    /// Writes the files derived from the list of identities: the revocation list, and the routers' configuration.
     fn write_shared(&mut self) -> anyhow::Result<()> {
         self.identities.crl_number += 1;
         self.write_identities()?;
@@ -215,6 +220,7 @@ impl Authority {
                 });
             }
         }
+
         let now = OffsetDateTime::now_utc();
         let params = CertificateRevocationListParams {
             this_update: now - CLOCK_SKEW,
@@ -228,10 +234,10 @@ impl Authority {
     }
 }
 
-/// An identity is a role, or a role and a name, and is a folder's name, too.
+/// Validates an identity, `ROLE` or `ROLE.NAME`, which is also a folder's name.
 ///
 /// # Errors
-/// If it is neither.
+/// If the role is unknown, or the name is not 1 to 48 letters, digits, `-` and `_`.
 pub(crate) fn check_identity(identity: &str) -> anyhow::Result<()> {
     let (role, name) = identity.split_once('.').map_or((identity, None), |(role, name)| (role, Some(name)));
     role.parse::<Role>()?;
@@ -246,7 +252,7 @@ pub(crate) fn check_identity(identity: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Certificate and private key of a new authority, in PEM.
+/// Creates the certificate and private key of an authority, in PEM.
 fn new_ca() -> anyhow::Result<(String, String)> {
     let mut params = CertificateParams::new(Vec::new())?;
     let now = OffsetDateTime::now_utc();

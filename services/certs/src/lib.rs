@@ -1,7 +1,7 @@
-//! A certificate authority for one network: certificates and tokens by role, and a router's configuration.
+//! Certificate authority of one network: certificates and tokens by role, and the router's configuration.
 //!
-//! [`authority`] issues, renews and revokes; [`router`] makes zenohd's configuration from the table of roles in
-//! [`wire::access`]; [`tokens`] are for clients that have no certificate.
+//! [`authority`] issues, renews and revokes certificates; [`router`] derives zenohd's configuration from the table of roles in
+//! [`wire::access`]; [`tokens`] are for clients without a certificate.
 
 pub mod authority;
 mod identities;

@@ -1,4 +1,4 @@
-//! The configuration of a zenoh router that lets each role do what it may, and nothing else.
+//! Configuration of a zenoh router with access control by role.
 
 use crate::identities::Identities;
 use anyhow::Context;
@@ -7,17 +7,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
 
-/// Where a router listens.
+/// Listening endpoint of a router.
 const LISTEN: &str = "tls/0.0.0.0:7447";
-/// Most connections of a router at the same time.
+/// Maximum number of connections of a router.
 const MAX_SESSIONS: usize = 1000;
-/// Batches of messages, each of 64 KiB at most, that wait for a link: the most that zenoh allows.
+/// Length of a link's queue, in batches of up to 64 KiB: zenoh's maximum.
 const QUEUE_BATCHES: usize = 16;
-/// Most frames, or actions, that a worker shows in a second.
+/// Highest rate of a worker's frames and of its actions, per second, for viewers.
 const FRAMES_PER_SECOND: f64 = 200.0;
-/// Room for what is sent beside a payload.
+/// Allowance for attachments beside a payload, in bytes.
 const ATTACHMENT_BYTES: usize = 1024;
-/// Every kind of message that access control knows.
+/// All message types of zenoh's access control.
 const MESSAGES: [&str; 9] = [
     "put",
     "delete",
@@ -30,7 +30,7 @@ const MESSAGES: [&str; 9] = [
     "declare_liveliness_subscriber",
 ];
 
-/// Messages that a role may exchange with a router, by direction as the router sees it.
+/// Message type that a role may exchange with a router, and its direction as seen from the router.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Permission {
     flow: &'static str,
@@ -55,7 +55,7 @@ pub fn config(folder: &Path, identities: &Identities) -> anyhow::Result<Value> {
             "link": {
                 "protocols": ["tls"],
                 "rx": { "max_message_size": wire_max_bytes() },
-                // On one thread, which TLS links are kept to, a full queue is emptied only after whoever fills it has given up.
+                // TLS links run on one thread, where a full queue is drained only after its sender has given up: long queues.
                 "tx": { "queue": { "size": { "data": QUEUE_BATCHES, "data_low": QUEUE_BATCHES } } },
                 "tls": {
                     "root_ca_certificate": file("ca.pem"),
@@ -75,13 +75,13 @@ pub fn config(folder: &Path, identities: &Identities) -> anyhow::Result<Value> {
     }))
 }
 
-/// Largest payload of any endpoint, with what goes beside it.
+/// Largest payload of any endpoint, with its attachment, in bytes.
 fn wire_max_bytes() -> usize {
     let largest = ENDPOINTS.iter().map(|endpoint| endpoint.max_bytes).max();
     largest.unwrap_or_default() + ATTACHMENT_BYTES
 }
 
-/// The key of an endpoint below each namespace.
+/// Key expressions of an endpoint, one per namespace.
 fn keys(endpoint: &Endpoint, namespaces: &BTreeSet<String>) -> anyhow::Result<Vec<String>> {
     let key = endpoint.key()?;
     if namespaces.is_empty() {
@@ -94,7 +94,7 @@ fn keys(endpoint: &Endpoint, namespaces: &BTreeSet<String>) -> anyhow::Result<Ve
     namespaces.iter().map(below).collect()
 }
 
-/// Messages of the side that offers an endpoint, and of the side that uses it.
+/// Permissions of the roles that offer an endpoint, and of those that use it.
 fn permissions(kind: Kind) -> (&'static [Permission], &'static [Permission]) {
     const fn to_router(message: &'static str) -> Permission {
         Permission { flow: "ingress", message }
@@ -102,6 +102,7 @@ fn permissions(kind: Kind) -> (&'static [Permission], &'static [Permission]) {
     const fn from_router(message: &'static str) -> Permission {
         Permission { flow: "egress", message }
     }
+
     match kind {
         Kind::Query => (
             &const { [to_router("declare_queryable"), to_router("reply"), from_router("query")] },
@@ -124,7 +125,8 @@ fn permissions(kind: Kind) -> (&'static [Permission], &'static [Permission]) {
     }
 }
 
-/// Default deny; what each role may. Names of certificates are compared as they are, so that every identity is listed.
+/// Access control: deny by default, and the permissions of each role. Zenoh compares common names exactly, so that every
+/// identity is listed.
 fn access_control(identities: &Identities) -> anyhow::Result<Value> {
     let mut allowed: BTreeMap<(Role, Permission), BTreeSet<String>> = BTreeMap::new();
     for endpoint in ENDPOINTS {
@@ -136,6 +138,7 @@ fn access_control(identities: &Identities) -> anyhow::Result<Value> {
             }
         }
     }
+
     let (mut rules, mut subjects, mut policies) = (Vec::new(), Vec::new(), Vec::new());
     for role in Role::ALL {
         let of_role = identities
@@ -146,9 +149,10 @@ fn access_control(identities: &Identities) -> anyhow::Result<Value> {
         if names.is_empty() {
             continue;
         }
+
         let mut ids = Vec::new();
         if role == Role::Router {
-            // `**` stops at a verbatim chunk.
+            // `**` does not match a verbatim chunk, so that every key is listed too.
             let mut keys = BTreeSet::from(["**".to_owned()]);
             for endpoint in ENDPOINTS {
                 keys.extend(self::keys(endpoint, &identities.namespaces)?);
@@ -168,6 +172,7 @@ fn access_control(identities: &Identities) -> anyhow::Result<Value> {
             }));
             ids.push(id);
         }
+
         subjects.push(json!({ "id": role.name(), "cert_common_names": names }));
         policies.push(json!({ "rules": ids, "subjects": [role.name()] }));
     }
@@ -176,10 +181,10 @@ fn access_control(identities: &Identities) -> anyhow::Result<Value> {
     }))
 }
 
-/// Comes before every permission.
+/// Least value in the order of permissions.
 const FIRST: Permission = Permission { flow: "", message: "" };
 
-/// Payloads that are larger than their messages may be are dropped.
+/// Low-pass filter, which drops payloads above the limits of their endpoints.
 fn low_pass_filter(namespaces: &BTreeSet<String>) -> anyhow::Result<Value> {
     let mut by_size: BTreeMap<usize, BTreeSet<String>> = BTreeMap::new();
     for endpoint in ENDPOINTS.iter().filter(|endpoint| endpoint.kind != Kind::Liveliness) {
@@ -194,7 +199,7 @@ fn low_pass_filter(namespaces: &BTreeSet<String>) -> anyhow::Result<Value> {
     Ok(filters.collect())
 }
 
-/// What workers show to viewers comes at a bounded rate.
+/// Downsampling, which bounds the rate of publications for viewers.
 fn downsampling(namespaces: &BTreeSet<String>) -> anyhow::Result<Value> {
     let mut rules = Vec::new();
     for endpoint in ENDPOINTS.iter().filter(|endpoint| endpoint.used_by == [Role::Viewer]) {

@@ -1,4 +1,4 @@
-//! Tokens for clients that have no certificate.
+//! Bearer tokens, for clients without a certificate.
 
 use crate::authority::{AUTHORITY, Authority, check_identity};
 use anyhow::{Context, ensure};
@@ -7,13 +7,13 @@ use service_kit::files;
 use std::path::PathBuf;
 use wire::access::Role;
 
-/// Name of the files of tokens.
+/// Name of token files.
 const TOKENS: &str = "tokens.json";
-/// Largest file of tokens, as for the services that read it.
+/// Largest token file, in bytes, as for the services that read it.
 const MAX_BYTES: usize = 1 << 20;
 
 impl Authority {
-    /// A new token for an identity, which stands in no file: only its digest is kept, where planners and trainers find it.
+    /// Issues a token to an identity. Only its digest is stored, in the token files of planners and trainers.
     ///
     /// # Errors
     /// If the identity is malformed or was revoked, or a file cannot be read or written.
@@ -29,7 +29,7 @@ impl Authority {
         Ok(token)
     }
 
-    /// Revokes every token of an identity; answers how many there were.
+    /// Revokes all tokens of an identity, and returns their number.
     ///
     /// # Errors
     /// If a file cannot be read or written.
@@ -41,7 +41,7 @@ impl Authority {
         Ok(before - file.tokens.len())
     }
 
-    /// Lays the file of tokens where planners and trainers find it, also an empty one.
+    /// Writes the token file, even if empty, into the folders of planners and trainers.
     ///
     /// # Errors
     /// If a file cannot be read or written.

@@ -13,28 +13,28 @@ use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
 use zenoh::query::QueryTarget;
 use zenoh::{Session, Wait};
 
-/// Time for what is denied not to arrive.
+/// Wait for messages that must not arrive.
 const SETTLED: Duration = Duration::from_millis(300);
-/// Time for what is allowed to arrive.
+/// Timeout of messages that must arrive.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Time that a query has.
+/// Timeout of a query.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 type Pairs = BTreeSet<(Role, Role)>;
 
-/// Pairs of roles, of which the second may use what the first offers. A router passes on everything.
+/// Permitted pairs of roles: the first offers, the second uses. A router may do both.
 fn expected(endpoint: &Endpoint) -> Pairs {
     let may = |roles: &[Role], role| role == Role::Router || roles.contains(&role);
     let pairs = Role::ALL.into_iter().flat_map(|offering| Role::ALL.map(|using| (offering, using)));
     pairs.filter(|(offering, using)| may(endpoint.offered_by, *offering) && may(endpoint.used_by, *using)).collect()
 }
 
-/// The key at which a role offers.
+/// Key at which a role offers.
 fn key_of(endpoint: &Endpoint, role: Role) -> String {
     endpoint.key().unwrap().replace('*', role.name())
 }
 
-/// Pairs of roles, of which the second gets an answer of the first.
+/// Pairs of roles where the second gets an answer of the first.
 async fn answered(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let mut queryables = Vec::new();
     for (role, session) in sessions {
@@ -59,7 +59,7 @@ async fn answered(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expec
     .await
 }
 
-/// Pairs of roles, of which the second hears what the first publishes.
+/// Pairs of roles where the second receives a publication of the first.
 async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let heard = Arc::new(Mutex::new(BTreeSet::new()));
     let mut subscribers = Vec::new();
@@ -81,7 +81,7 @@ async fn heard(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected
     .await
 }
 
-/// Pairs of roles, of which the second sees the token of the first.
+/// Pairs of roles where the second sees the liveliness token of the first.
 async fn seen(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected: &Pairs) -> Pairs {
     let mut tokens = Vec::new();
     for (role, session) in sessions {
@@ -102,7 +102,7 @@ async fn seen(endpoint: &Endpoint, sessions: &BTreeMap<Role, Session>, expected:
     .await
 }
 
-/// Looks again until everything that is expected is there, then once more for what is not to be: declarations take their time.
+/// Polls until all expected pairs are there, then waits and polls once more for unexpected ones: declarations take time.
 async fn until(expected: &Pairs, look: impl AsyncFn() -> Pairs) -> Pairs {
     let all = async {
         while !look().await.is_superset(expected) {
@@ -115,7 +115,7 @@ async fn until(expected: &Pairs, look: impl AsyncFn() -> Pairs) -> Pairs {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn each_role_does_what_it_may_and_nothing_else() {
+async fn each_role_has_exactly_its_permissions() {
     let network = Network::start().await;
     let mut sessions = BTreeMap::new();
     for role in Role::ALL {

@@ -1,4 +1,4 @@
-//! Who has no place in the network is not let in.
+//! Refusals of clients without a valid certificate.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -13,9 +13,9 @@ use std::time::Duration;
 use tempfile::tempdir;
 use wire::{Code, key, query};
 
-/// Time for an identity that is known to get in.
+/// Timeout of a known identity's connection.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Time for one that is not to get in, if it could.
+/// Wait for a connection that must not succeed.
 const DENIED: Duration = Duration::from_secs(3);
 
 async fn gets_in(config: &SessionConfig, within: Duration) -> bool {
@@ -26,21 +26,21 @@ async fn gets_in(config: &SessionConfig, within: Duration) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_a_valid_certificate_of_the_authority_gets_in() {
+async fn only_a_valid_certificate_of_the_authority_connects() {
     let network = Network::start().await;
     assert!(gets_in(&network.config("client"), PATIENCE).await);
 
-    // Another authority's client, who trusts the router.
+    // A client of another authority, which trusts the router.
     let other = tempdir().unwrap();
     authority(other.path()).init(&BTreeSet::new(), BTreeSet::new()).unwrap();
     std::fs::copy(network.files("client").join("ca.pem"), other.path().join("client/ca.pem")).unwrap();
     assert!(!gets_in(&config(&other.path().join("client"), network.port), DENIED).await);
 
-    // A certificate that ends as it begins.
+    // An expired certificate.
     Authority::open(network.folder.path(), 0).unwrap().issue("client.late", &BTreeSet::new()).unwrap();
     assert!(!gets_in(&network.config("client.late"), DENIED).await);
 
-    // No certificate, and no encryption.
+    // Neither certificate nor encryption.
     let plain = SessionConfig {
         tls_ca: None,
         tls_certificate: None,
@@ -52,7 +52,7 @@ async fn only_a_valid_certificate_of_the_authority_gets_in() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_revoked_identity_is_denied_everything_and_does_not_come_back() {
+async fn a_revoked_identity_is_denied_everything_for_good() {
     let mut network = Network::start().await;
     let hosts = BTreeSet::new();
     let (client, planner) = (network.session("client").await, network.session("planner").await);
@@ -80,7 +80,7 @@ async fn a_revoked_identity_is_denied_everything_and_does_not_come_back() {
 }
 
 #[test]
-fn the_authority_keeps_what_is_valid_renews_what_is_not_and_hides_its_keys() {
+fn the_authority_keeps_valid_certificates_renews_others_and_protects_its_keys() {
     let folder = tempdir().unwrap();
     let read = |file: &str| std::fs::read(folder.path().join(file)).unwrap();
     let none = BTreeSet::new();

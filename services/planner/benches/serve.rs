@@ -1,5 +1,5 @@
-//! The service's side of `make bench-plan`: a planner in a process of its own, and clients that ask it for plans one after the
-//! other. Each measurement is a line of JSON; those of a turn at as many clients follow each other at once, to be compared.
+//! Service benchmark of `make bench-plan`: a planner in a process of its own, and clients with one plan request in flight each. A
+//! measurement is a line of JSON; those of one turn and number of clients are adjacent, for comparison.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
@@ -25,29 +25,29 @@ const MODEL: &str = "cpn";
 const NAME: &str = "bench";
 const CLIENTS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Of a robot that moves ten times a second.
+/// Deadline of a plan, that of a robot with ten actions per second.
 const DEADLINE: Duration = Duration::from_millis(100);
-/// Updates of a plan under overload: enough that asking costs little beside planning.
+/// Updates of a plan under overload, so many that the transport costs little compared with planning.
 const HEAVY_UPDATES: u32 = 20;
 const OVERLOAD: f64 = 4.0;
 
 #[derive(Parser)]
 struct Args {
-    /// Where the lines go.
+    /// Output file of the measurements.
     #[arg(long)]
     out: PathBuf,
-    /// How long each measurement takes.
+    /// Duration of each measurement.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
-    /// How often each is taken.
+    /// Number of turns.
     #[arg(long, default_value_t = 5)]
     turns: u32,
-    /// What `cargo bench` says.
+    /// Flag that `cargo bench` passes.
     #[arg(long, hide = true)]
     bench: bool,
 }
 
-/// Ends the planner when it is dropped.
+/// Process of the planner, killed when dropped.
 struct Process(Child);
 
 impl Drop for Process {
@@ -57,15 +57,15 @@ impl Drop for Process {
     }
 }
 
-/// A planner in a process of its own.
+/// Planner in a process of its own.
 struct Server {
     _process: Process,
-    /// Where zenoh and gRPC are.
+    /// Addresses of zenoh and gRPC.
     endpoints: [String; 2],
     shared_memory: bool,
 }
 
-/// One way to reach a planner.
+/// Client of one transport.
 #[derive(Clone)]
 enum Client {
     InProcess(PlannerCore),
@@ -74,7 +74,7 @@ enum Client {
 }
 
 impl Client {
-    /// As robots join that only ask: by a session each, which knows none but the planner.
+    /// Opens a session as a robot does: in client mode, connected to the planner only.
     async fn zenoh(Server { endpoints: [endpoint, _], shared_memory, .. }: &Server) -> Self {
         let mut config = zenoh::Config::default();
         for (key, value) in [
@@ -112,14 +112,16 @@ async fn main() {
     };
     let duration = Duration::from_secs_f64(args.seconds);
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
+
     let (tcp, goal) = start(&models, false).await;
     let (shared, same_goal) = start(&models, true).await;
     let grpc_listen = ([127, 0, 0, 1], 0).into();
     let planner = planner::Config { models_dir: models.clone(), grpc_listen, ..Default::default() };
     let planner = planner::start(planner).await.unwrap();
     let here = planner.core().register_goal(RegisterGoalRequest { image: image(0) }).unwrap().goal_id;
-    assert!(goal == same_goal && goal == here, "a goal's id is what is in its picture");
-    // Once: a planner keeps what a session shared with it mapped until it ends (eclipse-zenoh/zenoh#2787).
+    assert!(goal == same_goal && goal == here, "a goal's id is the digest of its image");
+
+    // Once, since a planner keeps mapped what closed sessions shared (eclipse-zenoh/zenoh#2787).
     let sharing = join_all((0..CLIENTS[CLIENTS.len() - 1]).map(|_| Client::zenoh(&shared))).await;
     for (_, count) in (0..args.turns).flat_map(|turn| CLIENTS.map(|count| (turn, count))) {
         tell(batches(&models, count, duration));
@@ -131,11 +133,12 @@ async fn main() {
         let clients = vec![Client::InProcess(planner.core()); count];
         tell(closed_loop("in-process service", clients, &goal, duration).await);
     }
+
     tell(overload(Client::zenoh(&tcp).await, &goal, duration * args.turns).await);
     planner.shutdown().await.unwrap();
 }
 
-/// Plans by the library, so many at a time, without a service: what there is to be had.
+/// Plans by the library in batches, without a service: the upper bound of the throughput.
 fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     let bytes = std::fs::read(models.join(format!("{MODEL}.safetensors"))).unwrap();
     let mut planner = cpn::Planner::new(checkpoint::from_bytes(&bytes).unwrap().agent, Precision::Float32, 1);
@@ -154,7 +157,7 @@ fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     line("library", batch, batch * took.len(), started.elapsed(), &mut took)
 }
 
-/// Clients that ask as soon as they have an answer.
+/// Closed-loop clients, which send a request as soon as the last is answered.
 async fn closed_loop(transport: &str, clients: Vec<Client>, goal: &str, duration: Duration) -> Value {
     let count = clients.len();
     let warm = Instant::now() + Duration::from_millis(300);
@@ -178,12 +181,13 @@ async fn closed_loop(transport: &str, clients: Vec<Client>, goal: &str, duration
             took
         })
     };
+
     let runs = join_all(clients.into_iter().enumerate().map(run)).await;
     let mut took: Vec<_> = runs.into_iter().flat_map(Result::unwrap).collect();
     line(transport, count, took.len(), duration, &mut took)
 }
 
-/// Requests of heavy plans, with a deadline, four times as many as can be answered.
+/// Overload: requests of slow plans with a deadline, at four times the rate that can be answered.
 async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
     let search = Search {
         solver: wire::planner::Solver::Gradient,
@@ -192,12 +196,14 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
         anytime: false,
     };
     let heavy = |frame| PlanRequest { search: Some(search), ..request(goal, frame) };
+
     let (started, mut alone) = (Instant::now(), 0);
     while started.elapsed() < Duration::from_secs(1) {
         join_all((0..16).map(|frame| client.plan(heavy(frame)))).await.into_iter().for_each(|plan| drop(plan.unwrap()));
         alone += 16;
     }
     let capacity = f64::from(alone) / started.elapsed().as_secs_f64();
+
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / (OVERLOAD * capacity)));
     let (started, mut asked) = (Instant::now(), Vec::new());
     while started.elapsed() < duration {
@@ -209,6 +215,7 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
             (answer, asked.elapsed().as_secs_f64())
         }));
     }
+
     let answers: Vec<_> = join_all(asked).await.into_iter().map(Result::unwrap).collect();
     let seconds = |keep: &dyn Fn(&Result<PlanResponse, Error>) -> bool| {
         let mut kept: Vec<_> = answers.iter().filter(|(answer, _)| keep(answer)).map(|(_, seconds)| *seconds).collect();
@@ -226,7 +233,7 @@ async fn overload(client: Client, goal: &str, duration: Duration) -> Value {
     })
 }
 
-/// Starts a planner, and registers a goal with it; answers its id.
+/// Starts a planner and registers a goal; returns the goal's id.
 async fn start(models: &Path, shared_memory: bool) -> (Server, String) {
     let free = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let (zenoh, grpc) = (format!("tcp/{}", free()), free());
@@ -250,14 +257,14 @@ fn request(goal: &str, frame: u8) -> PlanRequest {
     PlanRequest::new(MODEL, Goal::Id(goal.into()), image(frame).into())
 }
 
-/// A picture that no other number gives.
+/// Image that is distinct for each number.
 fn image(number: u8) -> Image {
     let side = cpn::images::SIZE as u32;
     let data = (0..cpn::images::BYTES).map(|at| (at as u8).wrapping_mul(31) ^ number).collect();
     Image::new(side, side, data).unwrap()
 }
 
-/// A measurement of latencies and, among them, the service's own time, in seconds.
+/// Measurement of latencies, and of the service's own part of them, in seconds.
 fn line(transport: &str, clients: usize, plans: usize, duration: Duration, took: &mut [(f64, f64)]) -> Value {
     let column = |of: fn(&(f64, f64)) -> f64| {
         let mut values: Vec<_> = took.iter().map(of).collect();
@@ -273,7 +280,7 @@ fn line(transport: &str, clients: usize, plans: usize, duration: Duration, took:
     })
 }
 
-/// Of sorted values; NaN of none.
+/// Quantile of sorted values; NaN if there are none.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     sorted.get((share * sorted.len() as f64) as usize).copied().unwrap_or(f64::NAN)
 }

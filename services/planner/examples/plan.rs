@@ -1,4 +1,4 @@
-//! Asks a planner over zenoh for a plan towards a picture.
+//! Plan request over zenoh, towards a goal image.
 //!
 //! cargo run --release -p planner --example plan -- examples/goal.png examples/frame.png
 

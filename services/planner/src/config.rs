@@ -1,4 +1,4 @@
-//! Settings of the planner.
+//! Settings and command line of the planner.
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use cpn::Precision;
@@ -10,7 +10,7 @@ use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::path::PathBuf;
 
-/// Settings of a planner: options of its command line, keys of its file.
+/// Settings of a planner: options of its command line, and keys of its configuration file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -82,7 +82,7 @@ impl Default for Config {
     }
 }
 
-/// Reader of an option whose values have names.
+/// Parser of an option with named values.
 fn named<T>(names: &'static [&'static str]) -> impl TypedValueParser<Value = T>
 where
     T: serde::de::DeserializeOwned + Clone + Send + Sync + 'static,
@@ -90,7 +90,7 @@ where
     PossibleValuesParser::new(names).try_map(|name| config::from_name(&name))
 }
 
-/// Paths in a list or, as in the environment, in one text with commas between them.
+/// Deserialises a list of paths or, as from the environment, one string of paths separated by commas.
 fn listed<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "expected a list of files, or their names with commas between them")]

@@ -1,4 +1,4 @@
-//! The planner without its transports: valid requests in, answers out.
+//! Planner service without transports: validated requests in, answers out.
 
 use crate::config::Config;
 use crate::goals::Goals;
@@ -21,12 +21,12 @@ use wire::planner::{
 };
 use wire::{Code, Error, Image, Observation};
 
-/// Checkpoints that are read at the same time at most: each may take as much memory as the largest model.
+/// Maximum number of concurrent checkpoint loads: each may take as much memory as the largest model.
 const MAX_LOADS: usize = 4;
-/// How the names of checkpoint files end.
+/// File name extension of checkpoints.
 const EXTENSION: &str = "safetensors";
 
-/// The planner, as its transports and programs that embed it call it. Clones are the same planner.
+/// Handle of the planner, for its transports and for programs that embed it. Clones share the planner.
 #[derive(Debug, Clone)]
 pub struct PlannerCore {
     thread: ModelThread,
@@ -39,10 +39,11 @@ pub struct PlannerCore {
 }
 
 impl PlannerCore {
-    /// Loads every checkpoint of the model folder and starts to serve them.
+    /// Loads all checkpoints of the model folder and starts serving them.
     ///
     /// # Errors
-    /// Names the first checkpoint that cannot be loaded or is not signed as it must be, and why; or a file of keys.
+    /// If a checkpoint cannot be loaded or lacks a required signature, there are more than the model capacity, or a file of
+    /// keys is invalid. The error names the file.
     pub(crate) async fn start(config: &Config) -> anyhow::Result<Self> {
         let engine = engines::build(config.engine, config.device, config.threads.get().into())?;
         let computing = Computing { engine, precision: config.precision.where_faster() };
@@ -51,6 +52,7 @@ impl PlannerCore {
                 "precision: expected a processor with instructions for bfloat16 (AVX512-BF16), got none; embedding in float32"
             );
         }
+
         let signatures = Arc::new(Signatures::new(config)?);
         let (folder, checked) = (config.models_dir.clone(), Arc::clone(&signatures));
         let used = computing.clone();
@@ -60,6 +62,7 @@ impl PlannerCore {
         for Model { info, .. } in &models {
             info!(model = info.name, method = info.method, digest = info.digest, "serving");
         }
+
         Ok(Self {
             thread: ModelThread::start(config, models).context("starting the model thread")?,
             goals: Arc::new(Goals::new(config.goal_capacity)),
@@ -71,20 +74,19 @@ impl PlannerCore {
         })
     }
 
-    /// The next actions towards the goal, by the named model. A goal that is not an id is registered on the way.
+    /// Plans actions towards the goal with the named model. A goal that is not an id is registered.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse; `NOT_FOUND`
-    /// for an unknown model or goal id;
-    /// `FAILED_PRECONDITION` if the pictures and those the model was trained on were rendered differently, or the checkpoint
-    /// that must answer is not kept;
-    /// `RESOURCE_EXHAUSTED` if the queue is full, or so long that the deadline would pass; `DEADLINE_EXCEEDED` once the
-    /// deadline has passed; `INTERNAL` for a plan that is not finite; `UNAVAILABLE` during shutdown.
+    /// for an unknown model or goal id; `FAILED_PRECONDITION` if the render specs of observation, goal and training data
+    /// differ, or the required checkpoint is not kept; `RESOURCE_EXHAUSTED` if the queue is full, or the expected wait exceeds
+    /// the deadline; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan that is not finite; `UNAVAILABLE`
+    /// during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
         self.thread.plan(self.task(request)?).await
     }
 
-    /// Callback form of `plan`: `reply` is called once, on a thread that it may block.
+    /// Callback form of `plan`: `reply` is called once, on a thread where it may block.
     pub(crate) fn plan_then(&self, request: PlanRequest, reply: impl FnOnce(Answer) + Send + 'static) {
         match self.task(request) {
             Ok(task) => self.thread.plan_then(task, reply),
@@ -92,12 +94,12 @@ impl PlannerCore {
         }
     }
 
-    /// For what may block.
+    /// Outbox for replies that may block.
     pub(crate) fn outbox(&self) -> Outbox {
         self.thread.outbox()
     }
 
-    /// What the model thread is to do.
+    /// Resolves the names in a request and checks its images.
     fn task(&self, request: PlanRequest) -> Result<PlanTask, Error> {
         let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start } = request;
         if let Observation::Image(image) = &observation {
@@ -106,6 +108,7 @@ impl PlannerCore {
         if !self.thread.models().contains_key(&model) {
             return Err(unknown_model(&model, self.thread.models().keys()));
         }
+
         let (goal_field, (goal_id, goal)) = match goal {
             Goal::Id(id) => {
                 let goal = self.goals.get(&id)?;
@@ -117,6 +120,7 @@ impl PlannerCore {
             }
             Goal::Position(position) => ("goal_position", self.goals.register(position.into())),
         };
+
         Ok(PlanTask {
             model,
             model_digest,
@@ -132,7 +136,7 @@ impl PlannerCore {
         })
     }
 
-    /// Keeps a goal image; the same image gets the same id.
+    /// Registers a goal image; the same image gets the same id.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for an image that is not 84 x 84.
@@ -142,13 +146,13 @@ impl PlannerCore {
         Ok(RegisterGoalResponse { goal_id })
     }
 
-    /// Loads a checkpoint, tries it, and swaps it in between two plans. Until then, and after any fault, the model that
-    /// had the name before serves on.
+    /// Loads a checkpoint, warms it up, and swaps it in between two plans. Until then, and after any error, the previous model
+    /// of that name is served.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for a faulty checkpoint, with the reason; `NOT_FOUND` for a file that is not in the model
-    /// folder; `FAILED_PRECONDITION` for the name `random`, or if no trusted key signed it and that is refused;
-    /// `RESOURCE_EXHAUSTED` if others are being loaded, or the name is new and one too many.
+    /// `INVALID_ARGUMENT` for a faulty checkpoint, with the reason; `NOT_FOUND` for a file that is not in the model folder;
+    /// `FAILED_PRECONDITION` for the name `random`, or for a missing signature where one is enforced; `RESOURCE_EXHAUSTED` for
+    /// too many concurrent loads, or a new name beyond the model capacity.
     pub async fn load_model(&self, request: LoadModelRequest) -> Result<LoadModelResponse, Error> {
         check_replaceable(&request.model)?;
         self.check_capacity(&request.model)?;
@@ -161,13 +165,13 @@ impl PlannerCore {
         Ok(LoadModelResponse { model: self.swap_in(load).await? })
     }
 
-    /// The same with a published checkpoint, whose bytes must be what its manifest says; they are fetched only once its
-    /// signature has been checked.
+    /// Loads a published checkpoint as `load_model` does; the bytes must match the manifest, and are fetched only after its
+    /// signature has been verified.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for a faulty checkpoint or another one, with the reason; `FAILED_PRECONDITION` for the name
-    /// `random`, or if no trusted key signed it and that is refused; `RESOURCE_EXHAUSTED` if the name is new and one too many;
-    /// those of `fetch`.
+    /// `INVALID_ARGUMENT` for a faulty checkpoint, or one that does not match the manifest; `FAILED_PRECONDITION` for the name
+    /// `random`, or for a missing signature where one is enforced; `RESOURCE_EXHAUSTED` for a new name beyond the model
+    /// capacity; the errors of `fetch`.
     pub(crate) async fn load_published(
         &self,
         manifest: CheckpointManifest,
@@ -177,13 +181,13 @@ impl PlannerCore {
         self.check_capacity(&manifest.model)?;
         self.signatures.check_published(&manifest)?;
         let bytes = fetch.await?;
-        // It comes once and unasked, so that it waits where a client would be sent away.
+        // Waits for a place, where a client's request would be refused: an announcement has no client to retry it.
         let _load = self.loads.acquire().await;
         let computing = self.computing.clone();
         self.swap_in(move || Model::published(manifest, &bytes, &computing)).await.map(drop)
     }
 
-    /// Serves a model no longer. Searches that go on with it are finished; who names one of its checkpoints gets none.
+    /// Stops serving a model and all its checkpoints. Searches in progress with it are finished.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown name; `FAILED_PRECONDITION` for `random`; `UNAVAILABLE` during shutdown.
@@ -197,7 +201,7 @@ impl PlannerCore {
         Ok(UnloadModelResponse)
     }
 
-    /// Whether there is room for a model of this name, before its checkpoint is read.
+    /// Checks the model capacity for a name, before the checkpoint is read.
     fn check_capacity(&self, model: &str) -> Result<(), Error> {
         check_capacity(model, self.thread.models().keys(), self.model_capacity)
     }
@@ -208,7 +212,7 @@ impl PlannerCore {
         self.serve(model).await
     }
 
-    /// Serves a method that is built already, in place of the one of its name, from the next plan on. Nobody signs those.
+    /// Serves a method built in process, in place of the model of its name, from the next plan on. Signatures are not checked.
     ///
     /// # Errors
     /// `FAILED_PRECONDITION` for the name `random`; `UNAVAILABLE` during shutdown.
@@ -220,23 +224,23 @@ impl PlannerCore {
         Ok(info)
     }
 
-    /// The models being served.
+    /// Served models, ordered by name.
     pub fn list_models(&self) -> ListModelsResponse {
         ListModelsResponse { models: self.thread.models().values().cloned().collect() }
     }
 
-    /// Answers searches that go on with an error.
-    pub(crate) fn give_up(&self) {
-        self.thread.give_up();
+    /// Ends searches in progress, with an error.
+    pub(crate) fn abort_searches(&self) {
+        self.thread.abort_searches();
     }
 
-    /// Finishes the plans that are waiting; refuses every later request.
+    /// Finishes the queued plans, and refuses later requests.
     pub(crate) async fn stop(&self) {
         self.thread.stop().await;
     }
 }
 
-/// `random` and every checkpoint in `folder`.
+/// Loads all checkpoints in `folder`, and the model `random`.
 fn load_all(folder: &Path, signatures: &Signatures, computing: &Computing) -> anyhow::Result<Vec<Model>> {
     let mut models = vec![Model::random()];
     for path in checkpoints(folder)? {
@@ -249,7 +253,7 @@ fn load_all(folder: &Path, signatures: &Signatures, computing: &Computing) -> an
     Ok(models)
 }
 
-/// The checkpoint files of a folder, ordered by name. Only the folder that nobody named, the default, need not be there.
+/// Checkpoint files of a folder, ordered by name. Only the default folder may be missing.
 fn checkpoints(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     if folder == Config::default().models_dir && !folder.try_exists().context("models_dir")? {
         return Ok(Vec::new());
@@ -263,7 +267,7 @@ fn load_file(folder: &Path, path: &Path, signatures: &Signatures, computing: &Co
     let text = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
     let source = CheckpointSource::File(text(path.file_name()));
     let request = LoadModelRequest { model: text(path.file_stem()), source };
-    // A file's name is as free as a stranger's message: the trip through the wire applies the same rules to it.
+    // File names are untrusted; encoding and decoding applies the validation of messages to them.
     let request: LoadModelRequest = wire::decode(&wire::encode(request))?;
     check_replaceable(&request.model)?;
     Model::load(folder, request, signatures, computing)
@@ -300,12 +304,13 @@ mod tests {
         PlanRequest::new(RANDOM, Goal::Position(position), position.into())
     }
 
-    /// Answers that are not read hold up nobody but those whom they are for, however many they are.
+    /// Blocking replies, however many, delay no other request.
     #[tokio::test(flavor = "multi_thread")]
-    async fn answers_that_block_hold_up_nobody_else() {
+    async fn blocking_replies_delay_no_other_request() {
         let models_dir = tempfile::TempDir::new().unwrap();
         let config = Config { models_dir: models_dir.path().into(), ..Config::default() };
         let core = PlannerCore::start(&config).await.unwrap();
+
         let (sender, entered) = mpsc::channel();
         let (release, released) = mpsc::channel::<()>();
         let released = Arc::new(Mutex::new(released));
@@ -323,6 +328,7 @@ mod tests {
             let entered = Arc::clone(&entered);
             tokio::task::spawn_blocking(move || entered.lock().unwrap().recv_timeout(PATIENCE).unwrap())
         };
+
         for round in 0..20 {
             core.plan_then(request(), unread());
             has_entered().await.unwrap();
@@ -338,7 +344,8 @@ mod tests {
             );
             swapped.await.unwrap_or_else(|_| panic!("swap {round} waits for an answer to a client")).unwrap();
         }
-        // One after the other returns; plans go on as before.
+
+        // The blocked replies return one by one; plans continue as before.
         for _ in 0..20 {
             release.send(()).unwrap();
             core.plan(request()).await.unwrap();
@@ -347,9 +354,9 @@ mod tests {
         assert_eq!(core.plan(request()).await.unwrap_err().code, Code::Unavailable);
     }
 
-    /// A planner can be stopped while an answer is not read.
+    /// Shutdown completes while a reply blocks.
     #[tokio::test(flavor = "multi_thread")]
-    async fn an_answer_that_blocks_does_not_hold_up_shutdown() {
+    async fn a_blocking_reply_does_not_delay_shutdown() {
         let models_dir = tempfile::TempDir::new().unwrap();
         let config = Config { models_dir: models_dir.path().into(), ..Config::default() };
         let core = PlannerCore::start(&config).await.unwrap();

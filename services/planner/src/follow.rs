@@ -1,4 +1,4 @@
-//! Follows what a trainer announces: checks its signature, fetches, verifies, tries, swaps.
+//! Follower of a trainer's announcements: verifies the signature, fetches the checkpoint, checks it, and swaps it in.
 
 use crate::core::PlannerCore;
 use backon::{ConstantBuilder, Retryable};
@@ -11,15 +11,15 @@ use wire::{Code, Error, key, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
-/// How long one piece of a checkpoint may take.
+/// Timeout of the answer with one chunk of a checkpoint.
 const CHUNK_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Serves what is announced, one after the other.
+/// Follower of checkpoint announcements, which serves them one after the other.
 #[derive(Debug)]
 pub(crate) struct Follower {
     session: Session,
     core: PlannerCore,
-    /// When the announced checkpoint that was swapped in last was promoted, by model.
+    /// Promotion time of the latest announcement served, by model.
     promoted_unix_nanos: HashMap<String, u64>,
 }
 
@@ -28,16 +28,16 @@ impl Follower {
         Self { session, core, promoted_unix_nanos: HashMap::new() }
     }
 
-    /// Fetches and serves what a message announces, unless a later announcement was heeded already: they are repeated, and
-    /// may come in any order.
+    /// Fetches and serves an announced checkpoint, unless an announcement as late or later was served before: announcements
+    /// are repeated, and arrive in any order.
     ///
     /// # Errors
-    /// If the message is malformed, the checkpoint's signature is refused, it cannot be fetched or is not what its manifest
-    /// says, or it is faulty.
+    /// If the message is malformed, or the checkpoint's signature is refused, or the checkpoint cannot be fetched, does not
+    /// match its manifest, or is faulty.
     pub(crate) async fn follow(&mut self, message: &[u8]) -> Result<(), Error> {
         let CheckpointAnnouncement { manifest, promoted_unix_nanos } = wire::decode(message)?;
         let model = manifest.model.clone();
-        if self.promoted_unix_nanos.get(&model).is_some_and(|heeded| *heeded >= promoted_unix_nanos) {
+        if self.promoted_unix_nanos.get(&model).is_some_and(|latest| *latest >= promoted_unix_nanos) {
             return Ok(());
         }
         if !self.serves(&manifest) {
@@ -54,7 +54,7 @@ impl Follower {
     }
 }
 
-/// The bytes that a manifest names, piece by piece; not verified yet.
+/// Fetches the bytes of a manifest's checkpoint, in chunks; not verified.
 async fn fetch(session: &Session, manifest: &CheckpointManifest) -> Result<Vec<u8>, Error> {
     let CheckpointManifest { digest, size_bytes, .. } = manifest;
     let size = usize::try_from(*size_bytes).unwrap_or(usize::MAX);
@@ -62,6 +62,7 @@ async fn fetch(session: &Session, manifest: &CheckpointManifest) -> Result<Vec<u
         let limit = format!("at most {}", cpn::checkpoint::MAX_BYTES);
         return Err(Error::invalid("size_bytes", limit, size_bytes));
     }
+
     let key = key::checkpoint_chunk(digest)?;
     let mut bytes = Vec::with_capacity(size);
     while bytes.len() < size {
@@ -77,8 +78,8 @@ async fn fetch(session: &Session, manifest: &CheckpointManifest) -> Result<Vec<u
     Ok(bytes)
 }
 
-/// When to ask for a piece again: right after a reconnect a query can end without an answer, and many planners may ask at once.
-fn again() -> ConstantBuilder {
+/// Retry policy of chunk requests: right after a reconnect a query can end without an answer, and many planners may ask at once.
+fn retry_policy() -> ConstantBuilder {
     ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(4)
 }
 
@@ -89,7 +90,7 @@ async fn fetch_chunk(
 ) -> Result<Vec<u8>, Error> {
     let ask = || query::call(session, key, request.clone(), CHUNK_TIMEOUT);
     let answer: CheckpointChunkResponse = ask
-        .retry(again())
+        .retry(retry_policy())
         .when(|error: &Error| matches!(error.code, Code::Unavailable | Code::ResourceExhausted))
         .await?;
     Ok(answer.data)

@@ -1,33 +1,33 @@
-//! Goals as resources: registered once, named by their digest.
+//! Store of registered goals, by digest.
 
 use lru::LruCache;
 use std::num::NonZeroU16;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use wire::{Code, Error, Observation};
 
-/// The goals used last, by [`Observation::digest`].
+/// LRU store of goals, by [`Observation::digest`].
 #[derive(Debug)]
 pub(crate) struct Goals {
     goals: Mutex<LruCache<String, Arc<Observation>>>,
 }
 
 impl Goals {
-    /// A store of at most `capacity` goals.
+    /// Store of at most `capacity` goals.
     pub(crate) fn new(capacity: NonZeroU16) -> Self {
         Self { goals: Mutex::new(LruCache::new(capacity.into())) }
     }
 
-    /// Keeps a goal, in place of the one unused for longest if the store is full; answers its id.
+    /// Registers a goal and returns its id; a full store evicts the least recently used goal.
     pub(crate) fn register(&self, goal: Observation) -> (String, Arc<Observation>) {
         let id = goal.digest();
         let goal = self.goals().get_or_insert(id.clone(), || Arc::new(goal)).clone();
         (id, goal)
     }
 
-    /// The goal registered under an id.
+    /// Goal of an id.
     ///
     /// # Errors
-    /// If there is none: it never was, or others took its place.
+    /// `NOT_FOUND` if the goal was never registered, or was evicted.
     pub(crate) fn get(&self, id: &str) -> Result<Arc<Observation>, Error> {
         let mut goals = self.goals();
         let capacity = goals.cap();

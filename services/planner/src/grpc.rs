@@ -1,4 +1,4 @@
-//! The planner over gRPC: translation.
+//! gRPC transport of the planner.
 
 use crate::CHANGES;
 use crate::core::PlannerCore;
@@ -18,10 +18,10 @@ use wire::proto::planner_service_server::{PlannerService, PlannerServiceServer};
 use wire::trace::TRACEPARENT;
 use wire::{Message, proto, trace};
 
-/// The one method whose requests are large has a limit of its own.
+/// Path of the only method with large requests, which has a size limit of its own.
 const LOAD_MODEL_PATH: &str = "/cpn.v1.PlannerService/LoadModel";
 
-/// Listens and answers; healthy once it is told to be.
+/// Starts the gRPC server, whose health is `NOT_SERVING` until [`GrpcServer::ready`].
 ///
 /// # Errors
 /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
@@ -36,7 +36,7 @@ pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Acces
     GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(planner)).await
 }
 
-/// The generated service, by the core.
+/// Implementation of the generated service.
 struct Grpc(PlannerCore);
 
 #[tonic::async_trait]

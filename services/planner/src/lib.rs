@@ -1,8 +1,8 @@
-//! Serves plans from trained weights over zenoh and gRPC, and to clients of openpi.
+//! Planner service: plans from trained weights over zenoh, gRPC and openpi's protocol.
 //!
-//! [`core`] is the service; `grpc`, `zenoh` and `openpi` translate to it and nothing more. One thread (`model_thread`, `owner`)
-//! owns every model ([`model`]) and plans together what waits together; goals are kept beside it (`goals`). A model is
-//! replaced between two plans and only by one that has planned once already.
+//! [`core`] is the service without transports; `grpc`, `zenoh` and `openpi` only translate. One thread at a time (`model_thread`,
+//! `owner`) owns all models ([`model`]) and plans queued requests in batches; `goals` stores the registered goals. A model is
+//! swapped between two plans, and only for one that has been warmed up.
 
 pub mod config;
 pub mod core;
@@ -36,7 +36,7 @@ use std::time::Duration;
 use tracing::{info, warn};
 use wire::access;
 
-/// What can be changed of a planner.
+/// State-changing requests of a planner.
 pub(crate) const CHANGES: Changes = Changes {
     metric: "cpn_planner_changes_refused_total",
     methods: &[
@@ -45,11 +45,10 @@ pub(crate) const CHANGES: Changes = Changes {
     ],
 };
 
-/// How long requests in flight may take to finish at shutdown: with the rest of it, less than the ten seconds that orchestrators
-/// give.
+/// Timeout of requests in flight at shutdown, which then takes less than the ten seconds that orchestrators grant.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(7);
 
-/// A planner that runs.
+/// Running planner.
 #[derive(Debug)]
 pub struct Planner {
     core: PlannerCore,
@@ -59,9 +58,9 @@ pub struct Planner {
     connection: Connection,
 }
 
-/// Loads the models and serves them; when this returns, everything answers.
+/// Loads the models and serves them; when this returns, all transports answer.
 ///
-/// Wants tokio's multi-threaded runtime: zenoh panics on the other.
+/// Requires tokio's multi-threaded runtime: zenoh panics on the other.
 ///
 /// # Errors
 /// If a checkpoint is faulty, an address cannot be listened on, or is beyond the loopback interface without TLS, the name cannot
@@ -73,20 +72,23 @@ pub async fn start(config: Config) -> anyhow::Result<Planner> {
         let listen = session.listen_at(address, metrics::MAX_CONNECTIONS)?;
         metrics::serve(listen, access.clone(), access::may_scrape).await?;
     }
+
     let core = PlannerCore::start(&config).await?;
     let listen = session.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
     let mut grpc = grpc::start(core.clone(), listen, access.clone()).await?;
     let openpi = match config.openpi_listen {
         Some(address) => {
-            let listen = session.listen_at(address, openpi::MAX_WAITING)?;
+            let listen = session.listen_at(address, openpi::MAX_SOCKETS)?;
             Some(OpenpiServer::start(core.clone(), listen, access).await?)
         }
         None => None,
     };
+
     let zenoh = ZenohServer::start(core.clone(), &config).await?;
     let connection = zenoh.connection(session);
     grpc.follow(connection.connected());
     grpc.ready().await;
+
     let planner = Planner { core, grpc, openpi, zenoh, connection };
     let (grpc, openpi) = (planner.grpc_address(), planner.openpi_address().map(tracing::field::display));
     info!(name = config.name, %grpc, openpi, "planner is ready");
@@ -94,25 +96,25 @@ pub async fn start(config: Config) -> anyhow::Result<Planner> {
 }
 
 impl Planner {
-    /// Where gRPC listens.
+    /// Listening address of gRPC.
     pub fn grpc_address(&self) -> SocketAddr {
         self.grpc.address
     }
 
-    /// Where clients of openpi are listened to, if they are.
+    /// Listening address for clients of openpi, if it is enabled.
     pub fn openpi_address(&self) -> Option<SocketAddr> {
         self.openpi.as_ref().map(|openpi| openpi.address)
     }
 
-    /// The planner without a transport.
+    /// Handle of the planner without transports.
     pub fn core(&self) -> PlannerCore {
         self.core.clone()
     }
 
-    /// Takes no more requests, lets those in flight finish within seven seconds, and leaves the network.
+    /// Stops accepting requests, lets those in flight finish within seven seconds, and closes the session.
     ///
     /// # Errors
-    /// If gRPC had failed before, or zenoh does not close.
+    /// If gRPC had failed before, or the zenoh session cannot be closed.
     pub async fn shutdown(self) -> anyhow::Result<()> {
         let Self { core, mut grpc, openpi, mut zenoh, connection } = self;
         drop(connection);
@@ -127,9 +129,10 @@ impl Planner {
             grpc
         })
         .await;
+
         zenoh.close().await?;
-        // A search that goes on has nobody to answer any more.
-        core.give_up();
+        // Searches still in progress have no client left.
+        core.abort_searches();
         drained.unwrap_or_else(|_| {
             warn!("requests in flight were given up after {} s", DRAIN_TIMEOUT.as_secs());
             Ok(())

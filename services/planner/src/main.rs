@@ -1,4 +1,4 @@
-//! The planner's process.
+//! Process of the planner service.
 
 use planner::config::Args;
 use service_kit::{config, shutdown, telemetry};

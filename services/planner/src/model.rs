@@ -1,4 +1,4 @@
-//! A model as it is served, and what is checked before it is.
+//! Served models: loading, warm-up, checks of requests, and plans.
 
 use crate::load::{Costs, resolve};
 use crate::signatures::Signatures;
@@ -16,12 +16,12 @@ use wire::checkpoint::CheckpointManifest;
 use wire::planner::{CheckpointSource, LoadModelRequest, ModelInfo, PlanResponse, Search, StageTimes};
 use wire::{Code, Error, Observation};
 
-/// Name of the control of every comparison, always served.
+/// Name of the random baseline, which is always served.
 pub const RANDOM: &str = "random";
-/// A of the control: hand displacement x, y, z and gripper effort.
+/// Action width A of the random baseline: hand displacement x, y, z and gripper effort.
 const RANDOM_ACTIONS: usize = 4;
-/// Plans that are tried to see what that costs.
-const TRIALS: usize = 32;
+/// Number of samples in the warm-up's sampling search, which measures the time of a rollout.
+const WARM_UP_SAMPLES: usize = 32;
 
 /// Engine of all models, with the precision of their image encoders.
 #[derive(Debug, Clone)]
@@ -30,26 +30,26 @@ pub(crate) struct Computing {
     pub(crate) precision: Precision,
 }
 
-/// A method with the name and digest it is served under.
+/// Method with the name and digest it is served under.
 pub struct Model {
-    /// What clients are told of it.
+    /// Description for clients.
     pub info: ModelInfo,
-    /// How the pictures were rendered that it was trained on; empty if their origin is unknown.
+    /// Render spec of the training images; empty if unknown.
     pub render_spec: String,
-    /// What plans.
+    /// Planning method.
     pub method: Box<dyn Method>,
-    /// What its plans cost, as far as that is known.
+    /// Measured compute times of its plans.
     pub(crate) costs: Costs,
 }
 
 impl Model {
-    /// A method that is served as `info` says.
+    /// Model of a method, served as `info` describes.
     pub fn new(info: ModelInfo, render_spec: String, method: Box<dyn Method>) -> Self {
         let costs = Costs::new(&info.digest, method.updates().unwrap_or_default());
         Self { info, render_spec, method, costs }
     }
 
-    /// Uniform actions, whatever the images show.
+    /// Random baseline: uniform actions, independent of the observation.
     pub(crate) fn random() -> Self {
         let method = Random { actions: RANDOM_ACTIONS };
         let digest = checkpoint::digest(RANDOM.as_bytes());
@@ -57,10 +57,10 @@ impl Model {
         Self::new(info, String::new(), Box::new(method))
     }
 
-    /// Reads a checkpoint, from the bytes or from a file in `folder`, and tries it once. Blocks.
+    /// Loads a checkpoint, from bytes or from a file in `folder`, and warms it up. Blocks.
     ///
     /// # Errors
-    /// If the file is not there or its signature is refused, or for anything wrong with the checkpoint, with the reason in `got`.
+    /// If the file does not exist, its signature is refused, or the checkpoint is faulty, with the reason in `got`.
     pub(crate) fn load(
         folder: &Path,
         request: LoadModelRequest,
@@ -73,7 +73,7 @@ impl Model {
                 bytes
             }
             CheckpointSource::File(name) => {
-                // One byte more than a checkpoint may have, so that it is refused as too large.
+                // One byte beyond the limit, so that a larger file is refused as too large.
                 let read = files::read_inside(folder, &name, checkpoint::MAX_BYTES + 1);
                 let bytes = read.map_err(|e| match e.kind() {
                     io::ErrorKind::NotFound => Error::new(Code::NotFound, "file", "a file in the model folder", &name),
@@ -83,13 +83,13 @@ impl Model {
                 bytes
             }
         };
-        Self::tried(request.model, 0, read(&bytes)?, computing)
+        Self::build(request.model, 0, read(&bytes)?, computing)
     }
 
-    /// Reads a published checkpoint, if the bytes are what its manifest says, and tries it once. Blocks.
+    /// Loads a published checkpoint, whose bytes must match the manifest, and warms it up. Blocks.
     ///
     /// # Errors
-    /// If they are not, with the manifest's field, or for anything wrong with the checkpoint.
+    /// If the bytes do not match the manifest, with the manifest's field, or the checkpoint is faulty.
     pub(crate) fn published(manifest: CheckpointManifest, bytes: &[u8], computing: &Computing) -> Result<Self, Error> {
         let CheckpointManifest { model, version, digest, config_digest, .. } = manifest;
         let got = checkpoint::digest(bytes);
@@ -100,11 +100,11 @@ impl Model {
         if loaded.config_digest != config_digest {
             return Err(Error::invalid("config_digest", config_digest, loaded.config_digest));
         }
-        Self::tried(model, version, loaded, computing)
+        Self::build(model, version, loaded, computing)
     }
 
-    /// What a checkpoint holds, once it has planned.
-    fn tried(name: String, version: u32, loaded: Checkpoint, computing: &Computing) -> Result<Self, Error> {
+    /// Builds the model of a checkpoint and warms it up.
+    fn build(name: String, version: u32, loaded: Checkpoint, computing: &Computing) -> Result<Self, Error> {
         let Provenance { training_tasks, render_spec, .. } = loaded.provenance;
         let method = computing.engine.planner(&loaded.model, computing.precision);
         let method =
@@ -115,8 +115,8 @@ impl Model {
         Ok(model)
     }
 
-    /// Plans, from black to white or from one corner of space to another: the first request does not pay for it, weights that are
-    /// finite but lead to plans that are not are found out, and what plans cost is known.
+    /// Warm-up: plans from a black to a white image, or from one corner of space to another. It initialises everything lazy
+    /// before the first request, detects finite weights that give non-finite plans, and measures compute times.
     fn warm_up(&mut self) -> Result<(), Error> {
         let (black, white) = (vec![0; images::BYTES], vec![u8::MAX; images::BYTES]);
         let ends = if self.method.takes(Input::Image) {
@@ -126,27 +126,28 @@ impl Model {
         };
         let started = Instant::now();
         let ends = self.method.encode(&ends);
-        self.costs.embedded(2, started.elapsed());
+        self.costs.record_embedding(2, started.elapsed());
+
         let query = Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] };
         let updates = self.method.updates();
-        let trials = updates.map(|_| (Solver::Cem(TRIALS), 1));
+        let trials = updates.map(|_| (Solver::Cem(WARM_UP_SAMPLES), 1));
         let plans = [Some((Solver::Gradient, updates.unwrap_or_default())), trials];
-        // Twice, as the first time is like no other.
+        // Twice, since the first run is slower than later ones.
         for (solver, iterations) in plans.into_iter().flatten().flat_map(|plan| [plan, plan]) {
             let (started, iterations_left) = (Instant::now(), Iterations::Fixed(iterations));
             let plan =
                 self.method.plan(&[query], &mut method::Search { solver, iterations: iterations_left }).remove(0);
-            self.costs.rolled_out(solver, method::rollouts(solver, iterations), started.elapsed());
+            self.costs.record_rollouts(solver, method::rollouts(solver, iterations), started.elapsed());
             check_plan(&plan, &query).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
         }
         Ok(())
     }
 
-    /// Checks that the model can do what is asked of it.
+    /// Checks that a task fits the model.
     ///
     /// # Errors
-    /// If the goal or the observation is not what it takes, or was rendered differently; if it is to search and cannot, or to
-    /// start from actions that are not as many as it plans.
+    /// If the goal or observation is of the wrong kind or has another render spec, the task has a search or warm start but the
+    /// method does not plan, or the warm start is not `[horizon, actions]`.
     pub(crate) fn check(&self, task: &PlanTask) -> Result<(), Error> {
         self.check_takes(task.goal_field, &task.goal)?;
         self.check_takes(task.observation_field(), &task.observation)?;
@@ -157,6 +158,7 @@ impl Model {
                 return Err(Error::invalid(field, "none for a method that does not plan", self.method.name()));
             }
         }
+
         let (horizon, size) = (self.method.horizon(), self.method.actions());
         let start = &task.warm_start;
         if !start.is_empty() && (start.len() != horizon || start.iter().any(|action| action.len() != size)) {
@@ -178,7 +180,7 @@ impl Model {
         if self.method.takes(input) { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
     }
 
-    /// The embeddings `[Z]` of images of 84 x 84 or of positions.
+    /// Embeddings, `[Z]` each, of 84 x 84 images or of positions.
     pub(crate) fn encode(&mut self, observations: &[&Observation]) -> Vec<Vec<f32>> {
         let observed = observations.iter().map(|observation| match observation {
             Observation::Image(image) => Observed::Image(image.data()),
@@ -187,22 +189,22 @@ impl Model {
         self.method.encode(&observed.collect::<Vec<_>>())
     }
 
-    /// Plans for each query.
+    /// Plans for a batch of queries, each with the same search.
     pub(crate) fn plan(&mut self, queries: &[Query<'_>], search: Option<Search>) -> Vec<Plan> {
         let (solver, iterations) = resolve(search, self.method.updates().unwrap_or_default());
         self.method.plan(queries, &mut method::Search { solver, iterations: Iterations::Fixed(iterations) })
     }
 
-    /// A search that is gone on with by [`Method::resume`].
+    /// Initial state of a sliced search, which [`Method::resume`] advances.
     pub(crate) fn begin(&self, search: Option<Search>) -> Ongoing {
         let (solver, iterations) = resolve(search, self.method.updates().unwrap_or_default());
         Ongoing::new(solver, iterations, search.is_some_and(|search| search.anytime))
     }
 
-    /// What is answered to a task.
+    /// Response to a task, from its plan.
     ///
     /// # Errors
-    /// If any number of the plan is not finite.
+    /// If a number of the plan is not finite.
     pub(crate) fn response(&self, task: &PlanTask, plan: Plan, query: &Query<'_>, times: StageTimes) -> Answer {
         let latent_distance = check_plan(&plan, query)?;
         let first_action = plan.actions.first().into_iter().flatten().map(|v| v.clamp(-1.0, 1.0)).collect();
@@ -222,7 +224,7 @@ impl Model {
     }
 }
 
-/// The Euclidean distance between a query's ends, none if Z is 0, if that and all numbers of its plan are finite.
+/// Checks that a plan is finite; returns the Euclidean distance between the query's latents, none if Z is 0.
 fn check_plan(plan: &Plan, query: &Query<'_>) -> Result<Option<f32>, Error> {
     let squares = query.x.iter().zip(query.x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
     let latent_distance = (!query.x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);

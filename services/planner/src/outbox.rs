@@ -1,4 +1,4 @@
-//! Sending what may block, as to a client that does not read.
+//! Queue of replies that may block, as to a client that does not read.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -6,13 +6,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::runtime::Handle;
 
-/// How long one thing may take to send before others are sent beside it.
-pub(crate) const PATIENCE: Duration = Duration::from_millis(2);
+/// Time after which a reply counts as blocked, and others are sent by another thread.
+pub(crate) const STALL_TIMEOUT: Duration = Duration::from_millis(2);
 
+/// Deferred reply.
 type Send = Box<dyn FnOnce() + std::marker::Send>;
 
-/// Sends one thing after the other, on a thread that may block; if one takes long, another thread goes on with the rest. Whoever
-/// puts things in bounds their number.
+/// Queue that sends replies in order, on a thread that may block; while one blocks, another thread continues with the rest. It
+/// is unbounded: callers bound their replies in flight.
 #[derive(Clone)]
 pub(crate) struct Outbox {
     state: Arc<Mutex<State>>,
@@ -22,20 +23,20 @@ pub(crate) struct Outbox {
 #[derive(Default)]
 struct State {
     waiting: VecDeque<Send>,
-    /// Threads that send.
+    /// Number of sending threads.
     threads: usize,
-    /// Things that were sent.
+    /// Number of replies sent.
     sent: u64,
     is_watched: bool,
 }
 
 impl Outbox {
-    /// One whose threads are those of this runtime.
+    /// Outbox that sends on the blocking threads of a runtime.
     pub(crate) fn new(runtime: Handle) -> Self {
         Self { state: Arc::default(), runtime }
     }
 
-    /// Sends something as soon as may be, and does not wait for it.
+    /// Queues a reply; does not block.
     pub(crate) fn put(&self, send: impl FnOnce() + std::marker::Send + 'static) {
         let mut state = self.state();
         state.waiting.push_back(Box::new(send));
@@ -63,11 +64,11 @@ impl Outbox {
         state.threads -= 1;
     }
 
-    /// Starts another thread whenever nothing was sent for a while, until nothing waits.
+    /// Watchdog: starts another thread whenever nothing was sent during the stall timeout, until the queue is empty.
     async fn watch(self) {
         let mut before = self.state().sent;
         loop {
-            tokio::time::sleep(PATIENCE).await;
+            tokio::time::sleep(STALL_TIMEOUT).await;
             let mut state = self.state();
             if state.waiting.is_empty() {
                 state.is_watched = false;

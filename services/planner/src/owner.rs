@@ -1,4 +1,4 @@
-//! What one thread at a time owns: every model. What waits is planned together, as far as it can be.
+//! Owner of all models, used by one thread at a time: runs jobs, and plans queued tasks in batches.
 
 use crate::config::Config;
 use crate::load::{Load, SLICE, resolve};
@@ -6,7 +6,7 @@ use crate::model::Model;
 use crate::model_thread::Job;
 use crate::searches::Searches;
 use crate::served::Served;
-use crate::task::{Accepted, Answer, PlanTask, Reply, Waiting, too_late};
+use crate::task::{Accepted, Answer, PlanTask, Reply, Waiting, deadline_exceeded};
 use cpn::method::{Query, rollouts};
 use lru::LruCache;
 use metrics::{counter, histogram};
@@ -20,36 +20,36 @@ use tracing::{debug_span, error};
 use wire::planner::{ModelInfo, StageTimes};
 use wire::{Code, Error};
 
-/// What plans that a request's search makes longer may take together, so that others need not wait for long.
-const BATCH: Duration = Duration::from_millis(30);
+/// Longest estimated time of a batch whose requests choose a search, so that other tasks do not wait long.
+const MAX_BATCH_TIME: Duration = Duration::from_millis(30);
 
-/// The thread's side.
+/// Owner of all models.
 pub(crate) struct Owner {
     models: Served,
     /// Goal embeddings by goal and checkpoint, so that those of a swapped-out model are never used.
     embeddings: Embeddings,
-    /// Jobs that were taken from the channel and are not done yet, in order.
+    /// Jobs received from the channel and not done yet, in order.
     queue: VecDeque<Job>,
     searches: Searches,
     published: watch::Sender<BTreeMap<String, ModelInfo>>,
     load: Arc<Load>,
     batch_size: usize,
     batch_delay: Duration,
-    /// Answers that may block whoever sends them.
+    /// Replies that may block their sender.
     outgoing: VecDeque<(Reply, Answer)>,
 }
 
-/// Next thing to do.
+/// Outcome of a step: what the thread has to do next.
 #[expect(
     clippy::large_enum_variant,
     reason = "it is taken apart where it is made, and a box would be allocated for each plan"
 )]
 pub(crate) enum Step {
-    /// Another step.
+    /// Run another step.
     Next,
-    /// To answer, without the models, and then another step.
+    /// Send a reply without holding the models, then run another step.
     Reply(Reply, Answer),
-    /// Nothing, ever.
+    /// End the thread.
     End,
 }
 
@@ -62,7 +62,7 @@ impl Owner {
     ) -> Self {
         let mut served = Served::new(config.model_capacity.get().into(), config.retired_capacity.into());
         for model in models {
-            load.learn(&model.info.name, model.costs.clone());
+            load.register(&model.info.name, model.costs.clone());
             served.swap_in(model).expect("as many as fit");
         }
         Self {
@@ -78,12 +78,13 @@ impl Owner {
         }
     }
 
-    /// Does the next job. A search that takes long is gone on with between other jobs, for as long as these take, or while there
-    /// are none.
+    /// Runs the next job. Between jobs a sliced search advances, for as long as the job took, or for a full slice if there was
+    /// none.
     pub(crate) fn step(&mut self, jobs: &mpsc::Receiver<Job>) -> Step {
         if let Some((reply, answer)) = self.outgoing.pop_front() {
             return Step::Reply(reply, answer);
         }
+
         let next = || if self.searches.is_empty() { jobs.recv().ok() } else { jobs.try_recv().ok() };
         let job = self.queue.pop_front().or_else(next);
         let (started, idle) = (Instant::now(), job.is_none());
@@ -97,20 +98,21 @@ impl Owner {
             None if self.searches.is_empty() => return Step::End,
             Some(Job::Stop) => {
                 while !self.searches.is_empty() {
-                    self.go_on(SLICE);
+                    self.advance(SLICE);
                 }
                 self.outgoing.drain(..).for_each(|(reply, answer)| reply.send(answer));
                 return Step::End;
             }
             None => {}
         }
+
         if !self.searches.is_empty() {
-            self.go_on(if idle { SLICE } else { started.elapsed().min(SLICE) });
+            self.advance(if idle { SLICE } else { started.elapsed().min(SLICE) });
         }
         Step::Next
     }
 
-    /// Whether there is more to be sent.
+    /// Whether replies wait to be sent.
     pub(crate) fn has_outgoing(&self) -> bool {
         !self.outgoing.is_empty()
     }
@@ -118,7 +120,7 @@ impl Owner {
     fn serve(&mut self, model: Model) -> Result<(), Error> {
         let (info, costs) = (model.info.clone(), model.costs.clone());
         self.models.swap_in(model)?;
-        self.load.learn(&info.name, costs);
+        self.load.register(&info.name, costs);
         self.published.send_modify(|infos| drop(infos.insert(info.name.clone(), info)));
         Ok(())
     }
@@ -130,31 +132,31 @@ impl Owner {
         Ok(())
     }
 
-    fn go_on(&mut self, share: Duration) {
-        for (accepted, answer) in self.searches.go_on(&self.load, share) {
+    fn advance(&mut self, share: Duration) {
+        for (accepted, answer) in self.searches.advance(&self.load, share) {
             self.reply(accepted, answer);
         }
     }
 
-    /// What can be planned with the first: the tasks like it that wait, up to the next swap, as long as none would be late for
-    /// the others' sake.
+    /// Batch of a task: it and the compatible queued tasks, up to the next swap, as long as no deadline of the batch is missed.
     fn gather(&mut self, first: Waiting, jobs: &mpsc::Receiver<Job>) -> Vec<Waiting> {
-        // Plans are tried on all threads, and a search that is over when others wait has nobody beside it.
+        // Sampling searches use all threads already, and an anytime search ends as soon as other tasks wait.
         let alone = first.task.is_anytime() || first.task.is_sampled();
-        let most = if alone { 1 } else { self.batch_size.min(self.together(&first)) };
-        self.listen(&first.task, most, jobs);
+        let most = if alone { 1 } else { self.batch_size.min(self.batch_limit(&first)) };
+        self.fill_queue(&first.task, most, jobs);
+
         let swap = self.queue.iter().position(|job| !matches!(job, Job::Plan(_))).unwrap_or(self.queue.len());
         let after = self.queue.split_off(swap);
         let mut due = first.due();
-        let mut time = Load::time(first.estimate);
+        let mut time = Load::bound(first.estimate);
         let (mut batch, mut rest) = (vec![first], VecDeque::new());
         for job in self.queue.drain(..) {
             match job {
-                Job::Plan(waiting) if batch.len() < most && waiting.task.is_like(&batch[0].task) => {
+                Job::Plan(waiting) if batch.len() < most && waiting.task.is_compatible(&batch[0].task) => {
                     let earliest = due.into_iter().chain(waiting.due()).min();
-                    let together = time + Load::time(waiting.estimate);
+                    let together = time + Load::bound(waiting.estimate);
                     let in_time = earliest.is_none_or(|due| Instant::now() + together <= due);
-                    let short = waiting.estimate.long || waiting.task.search.is_none() || together <= BATCH;
+                    let short = waiting.estimate.is_long || waiting.task.search.is_none() || together <= MAX_BATCH_TIME;
                     if in_time && short {
                         (due, time) = (earliest, together);
                         batch.push(waiting);
@@ -165,26 +167,27 @@ impl Owner {
                 other => rest.push_back(other),
             }
         }
+
         rest.extend(after);
         self.queue = rest;
         batch
     }
 
-    /// How many tasks like this one can be planned for together.
-    fn together(&mut self, first: &Waiting) -> usize {
+    /// Largest batch of tasks like this one.
+    fn batch_limit(&mut self, first: &Waiting) -> usize {
         let PlanTask { model, model_digest, .. } = &first.task;
         match self.models.get(model, model_digest.as_deref()) {
-            Ok(model) if first.estimate.long => model.model().method.together(),
+            Ok(model) if first.estimate.is_long => model.model().method.together(),
             _ => usize::MAX,
         }
     }
 
-    /// Takes all that has come into the queue and, if the delay allows, waits for what makes the batch full.
-    fn listen(&mut self, first: &PlanTask, most: usize, jobs: &mpsc::Receiver<Job>) {
+    /// Moves received jobs to the queue and waits, within the batching delay, for a full batch.
+    fn fill_queue(&mut self, first: &PlanTask, most: usize, jobs: &mpsc::Receiver<Job>) {
         let until = Instant::now() + self.batch_delay;
         self.queue.extend(jobs.try_iter());
-        let is_like_first = |job: &&Job| matches!(job, Job::Plan(waiting) if waiting.task.is_like(first));
-        while self.queue.iter().filter(is_like_first).count() + 1 < most {
+        let is_compatible = |job: &&Job| matches!(job, Job::Plan(waiting) if waiting.task.is_compatible(first));
+        while self.queue.iter().filter(is_compatible).count() + 1 < most {
             match jobs.recv_timeout(until.saturating_duration_since(Instant::now())) {
                 Ok(job) => self.queue.push_back(job),
                 Err(_) => return,
@@ -192,35 +195,34 @@ impl Owner {
         }
     }
 
-    /// Answers tasks of one kind, whatever happens: a fault of one ends neither the thread nor the others' plans. Those that take
-    /// long are begun only.
+    /// Answers a batch. A panic in one task ends neither the thread nor the plans of the others. A sliced search is only begun.
     fn answer(&mut self, batch: Vec<Waiting>) {
         let started = Instant::now();
         let mut accepted = Vec::with_capacity(batch.len());
         for Waiting { task, enqueued, queued, place, reply, estimate } in batch {
             drop(queued);
-            let _place = estimate.long.then_some(place);
-            // A client that gave up has closed its end.
+            let _place = estimate.is_long.then_some(place);
             let late = task.deadline.filter(|deadline| started - enqueued >= *deadline);
-            let checked = late.map_or_else(|| self.check(&task), |deadline| Err(too_late(deadline)));
+            let checked = late.map_or_else(|| self.check(&task), |deadline| Err(deadline_exceeded(deadline)));
             let task = Accepted { task, enqueued, reply, estimate, _place };
             match checked {
-                _ if task.reply.is_given_up() => self.load.end(estimate),
+                _ if task.reply.is_cancelled() => self.load.end(estimate),
                 Ok(()) => accepted.push(task),
                 Err(error) => self.reply(task, Err(error)),
             }
         }
+
         let Some(first) = accepted.first() else { return };
         histogram!("cpn_planner_batch_size").record(accepted.len() as f64);
-        if first.estimate.long {
+        if first.estimate.is_long {
             return self.begin(accepted);
         }
 
         let tasks: Vec<_> = accepted.iter().map(|accepted| &accepted.task).collect();
-        let mut plans = self.guarded(&tasks, |owner| owner.plan(&tasks));
+        let mut plans = self.catching_panics(&tasks, |owner| owner.plan(&tasks));
         if tasks.len() > 1 && plans.iter().any(Result::is_err) {
-            // Which of them was at fault shows when each is alone.
-            plans = tasks.iter().flat_map(|task| self.guarded(&[task], |owner| owner.plan(&[task]))).collect();
+            // Planned one by one, so that only the faulty task fails.
+            plans = tasks.iter().flat_map(|task| self.catching_panics(&[task], |owner| owner.plan(&[task]))).collect();
         }
         for (accepted, mut plan) in accepted.into_iter().zip(plans) {
             if let Ok(response) = &mut plan {
@@ -235,7 +237,7 @@ impl Owner {
         if let Ok(response) = &answer {
             observe(response.times);
         }
-        if reply.may_block() && !self.load.has_stuck() {
+        if reply.may_block() && !self.load.has_blocked_reply() {
             self.outgoing.push_back((reply, answer));
         } else {
             reply.send(answer);
@@ -246,32 +248,34 @@ impl Owner {
         self.models.get(&task.model, task.model_digest.as_deref())?.model().check(task)
     }
 
-    /// Runs what answers tasks, one by one; a panic is everybody's error.
-    fn guarded(&mut self, tasks: &[&PlanTask], run: impl FnOnce(&mut Self) -> Vec<Answer>) -> Vec<Answer> {
+    /// Runs a closure that answers these tasks; a panic becomes the error of each.
+    fn catching_panics(&mut self, tasks: &[&PlanTask], run: impl FnOnce(&mut Self) -> Vec<Answer>) -> Vec<Answer> {
         catch_unwind(AssertUnwindSafe(|| run(self)))
             .unwrap_or_else(|panic| vec![Err(panicked(tasks[0], &*panic)); tasks.len()])
     }
 
-    /// Plans for tasks of one kind that were checked.
+    /// Plans a batch of checked tasks.
     fn plan(&mut self, tasks: &[&PlanTask]) -> Vec<Answer> {
         let Self { models, embeddings, load, .. } = self;
         let PlanTask { model: name, model_digest, search, .. } = tasks[0];
         let shared = models.get(name, model_digest.as_deref()).expect("checked");
         let mut model = shared.model();
         let started = Instant::now();
-        let ends = encode(&mut model, embeddings, tasks);
+        let latents = encode(&mut model, embeddings, tasks);
         let encoded = started.elapsed();
-        let queries = tasks.iter().zip(&ends);
+
+        let queries = tasks.iter().zip(&latents);
         let queries = queries.map(|(task, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start });
         let queries: Vec<_> = queries.collect();
         let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "search")).collect();
         let plans = model.plan(&queries, *search);
         drop(spans);
         let planned = started.elapsed() - encoded;
+
         load.measure(name, |costs| {
-            costs.embedded(tasks.len(), encoded);
+            costs.record_embedding(tasks.len(), encoded);
             let (solver, iterations) = resolve(*search, model.method.updates().unwrap_or_default());
-            costs.rolled_out(solver, tasks.len() * rollouts(solver, iterations), planned);
+            costs.record_rollouts(solver, tasks.len() * rollouts(solver, iterations), planned);
         });
         let times = StageTimes {
             queue_seconds: 0.0,
@@ -282,19 +286,19 @@ impl Owner {
         planned.map(|((task, plan), query)| model.response(task, plan, query, times)).collect()
     }
 
-    /// Begins a search for tasks of one kind that were checked.
+    /// Begins a sliced search for a batch of checked tasks.
     fn begin(&mut self, accepted: Vec<Accepted>) {
         let started = Instant::now();
         let Self { models, embeddings, .. } = self;
         let tasks: Vec<_> = accepted.iter().map(|accepted| &accepted.task).collect();
         let PlanTask { model: name, model_digest, .. } = tasks[0];
         let model = models.get(name, model_digest.as_deref()).expect("checked");
-        let ends = catch_unwind(AssertUnwindSafe(|| encode(&mut model.model(), embeddings, &tasks)));
+        let latents = catch_unwind(AssertUnwindSafe(|| encode(&mut model.model(), embeddings, &tasks)));
         let encoded = started.elapsed();
-        match ends {
-            Ok(ends) => {
-                self.load.measure(name, |costs| costs.embedded(tasks.len(), encoded));
-                self.searches.begin(&model, accepted, ends, encoded);
+        match latents {
+            Ok(latents) => {
+                self.load.measure(name, |costs| costs.record_embedding(tasks.len(), encoded));
+                self.searches.begin(&model, accepted, latents, encoded);
             }
             Err(panic) => {
                 let error = panicked(tasks[0], &*panic);
@@ -304,10 +308,10 @@ impl Owner {
     }
 }
 
-/// Embeddings by what was embedded and the checkpoint that did.
+/// LRU cache of goal embeddings, by goal id and checkpoint digest.
 type Embeddings = LruCache<(String, String), Vec<f32>>;
 
-/// Embeds every observation, and the goals that are not known yet: x and x_g of each task.
+/// Embeds all observations, and the goals that are not cached; returns (x, x_g) of each task.
 fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -> Vec<(Vec<f32>, Vec<f32>)> {
     let _spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "encode")).collect();
     let key = |task: &PlanTask| (task.goal_id.clone(), model.info.digest.clone());
@@ -322,7 +326,7 @@ fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -
     xs.into_iter().zip(x_gs).collect()
 }
 
-/// Counts an answer, and where its time went.
+/// Records metrics of an answer: the count, and the time of each stage.
 fn observe(times: StageTimes) {
     counter!("cpn_planner_plans_total").increment(1);
     for (stage, seconds) in
@@ -332,14 +336,14 @@ fn observe(times: StageTimes) {
     }
 }
 
-/// The error of a task whose planning panicked.
+/// Error of a task whose planning panicked.
 pub(crate) fn panicked(task: &PlanTask, panic: &(dyn Any + Send)) -> Error {
     let reason = panic_message(panic);
     error!(model = task.model, reason, "planning panicked");
     Error::new(Code::Internal, "plan", "a plan", reason)
 }
 
-/// What a panic says; `tch` panics with the message of libtorch.
+/// Message of a panic; `tch` panics with that of libtorch.
 fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic")

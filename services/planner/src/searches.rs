@@ -1,8 +1,8 @@
-//! Searches that take long: they are done in pieces, between which others are planned for.
+//! Sliced searches: long searches that run in time slices, between which other tasks are planned.
 
 use crate::load::{Load, SLICE};
 use crate::served::Shared;
-use crate::task::{Accepted, Answer, stopped, too_late};
+use crate::task::{Accepted, Answer, deadline_exceeded, shutting_down};
 use cpn::method::{Ongoing, Query};
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,27 +10,28 @@ use std::time::{Duration, Instant};
 use tracing::{Span, debug_span};
 use wire::planner::StageTimes;
 
-/// The part of a deadline that a search may use which goes on until then; the answer must still be sent.
+/// Fraction of its deadline that an anytime search uses; the rest is for sending the answer.
 const USABLE: f64 = 0.9;
 
-/// Searches that have begun. They take turns.
+/// Sliced searches in progress, in round-robin order.
 #[derive(Default)]
 pub(crate) struct Searches {
-    waiting: VecDeque<Searching>,
+    waiting: VecDeque<SlicedSearch>,
 }
 
-/// Tasks that are planned for together, one or more by gradient.
-pub(crate) struct Searching {
+/// Sliced search of a batch: several tasks by gradient, or a single one.
+pub(crate) struct SlicedSearch {
     tasks: Vec<Accepted>,
-    /// The embeddings of each, x and x_g.
-    ends: Vec<(Vec<f32>, Vec<f32>)>,
-    /// It stays the one that the search began with, whatever is swapped in.
+    /// Latents (x, x_g) of each task.
+    latents: Vec<(Vec<f32>, Vec<f32>)>,
+    /// Model at the search's begin, kept across swaps.
     model: Shared,
     ongoing: Ongoing,
-    /// Time it took so far.
+    /// Time spent on embedding.
     encoded: Duration,
+    /// Time spent on the search so far.
     searched: Duration,
-    /// Of the search of each.
+    /// Tracing span of each task's search.
     spans: Vec<Span>,
 }
 
@@ -39,45 +40,54 @@ impl Searches {
         self.waiting.is_empty()
     }
 
-    /// Tasks that are searched for.
+    /// Number of tasks in all searches.
     pub(crate) fn tasks(&self) -> usize {
-        self.waiting.iter().map(|searching| searching.tasks.len()).sum()
+        self.waiting.iter().map(|search| search.tasks.len()).sum()
     }
 
-    /// Takes in tasks that were embedded; each of them wants the same search.
+    /// Begins the search of a batch of embedded tasks.
     pub(crate) fn begin(
         &mut self,
         model: &Shared,
         tasks: Vec<Accepted>,
-        ends: Vec<(Vec<f32>, Vec<f32>)>,
+        latents: Vec<(Vec<f32>, Vec<f32>)>,
         encoded: Duration,
     ) {
         let spans = tasks.iter().map(|accepted| debug_span!(parent: &accepted.task.span, "search")).collect();
         let (model, ongoing) = (model.clone(), model.model().begin(tasks[0].task.search));
-        self.waiting.push_back(Searching { tasks, ends, model, ongoing, encoded, searched: Duration::ZERO, spans });
+        self.waiting.push_back(SlicedSearch {
+            tasks,
+            latents,
+            model,
+            ongoing,
+            encoded,
+            searched: Duration::ZERO,
+            spans,
+        });
     }
 
-    /// Goes on with the search whose turn it is, for as long as [`SLICE`] or, if others wait, as `share`. Answers those who
-    /// have waited long enough: an answer and its addressee each.
-    pub(crate) fn go_on(&mut self, load: &Load, share: Duration) -> Vec<(Accepted, Answer)> {
-        let searching_for = self.tasks();
+    /// Advances the next search, by [`SLICE`] or, if other tasks wait, by `share`. Returns the tasks that are done, with their
+    /// answers.
+    pub(crate) fn advance(&mut self, load: &Load, share: Duration) -> Vec<(Accepted, Answer)> {
+        let own_tasks = self.tasks();
         let Some(mut search) = self.waiting.pop_front() else { return Vec::new() };
-        let mut answers = search.dismiss(load);
+        let mut answers = search.remove_expired(load);
         if search.tasks.is_empty() {
             return answers;
         }
 
         let alone = search.tasks.len() == 1;
-        let (others, anyone) = (|| load.tasks() > searching_for, || load.tasks() > 1);
+        let (others, anyone) = (|| load.tasks() > own_tasks, || load.tasks() > 1);
         let task = &search.tasks[0];
         let end = task.task.is_anytime().then(|| {
             let deadline = task.task.deadline.unwrap_or_default();
             task.enqueued + deadline.mul_f64(USABLE)
         });
+
         let (started, before) = (Instant::now(), search.ongoing.rollouts());
         let mut last = started;
         let mut longest = Duration::ZERO;
-        // Whether there is time for another piece, if it takes as long as the last.
+        // Whether there is time for another iteration, if it takes as long as the last.
         let mut has_time = |now: Instant| {
             longest = now - std::mem::replace(&mut last, now);
             end.is_none_or(|end| now + longest < end)
@@ -87,14 +97,15 @@ impl Searches {
             let limit = if others() { share } else { SLICE };
             has_time(now) && now - started < limit && !(end.is_some() && anyone())
         };
+
         let searched = catch_unwind(AssertUnwindSafe(|| search.resume(&mut go_on)));
         let took = started.elapsed();
         search.searched += took;
         let rollouts = search.ongoing.rollouts() - before;
         let solver = search.ongoing.solver();
-        // Where a search begins it is not like the rest.
+        // The first slice includes the set-up of the search.
         if before > 0 {
-            load.measure(&search.tasks[0].task.model, |costs| costs.rolled_out(solver, rollouts, took));
+            load.measure(&search.tasks[0].task.model, |costs| costs.record_rollouts(solver, rollouts, took));
         }
 
         if let Err(panic) = searched {
@@ -102,13 +113,14 @@ impl Searches {
                 let error = crate::owner::panicked(&search.tasks[0].task, &*panic);
                 answers.extend(search.tasks.into_iter().map(|accepted| (accepted, Err(error.clone()))));
             } else {
-                // Which of them was at fault shows when each is alone.
-                for (accepted, ends) in search.tasks.into_iter().zip(search.ends) {
-                    self.begin(&search.model, vec![accepted], vec![ends], search.encoded);
+                // Searched one by one, so that only the faulty task fails.
+                for (accepted, latents) in search.tasks.into_iter().zip(search.latents) {
+                    self.begin(&search.model, vec![accepted], vec![latents], search.encoded);
                 }
             }
             return answers;
         }
+
         let now = Instant::now();
         let no_longer = end.is_some_and(|end| anyone() || now + longest >= end);
         if search.ongoing.is_over() || no_longer {
@@ -120,36 +132,36 @@ impl Searches {
     }
 }
 
-impl Searching {
-    /// Takes out those for whom it is too late, or who have gone.
-    fn dismiss(&mut self, load: &Load) -> Vec<(Accepted, Answer)> {
-        let mut dismissed = Vec::new();
+impl SlicedSearch {
+    /// Removes tasks that are past their deadline, cancelled or aborted, with their errors.
+    fn remove_expired(&mut self, load: &Load) -> Vec<(Accepted, Answer)> {
+        let mut removed = Vec::new();
         for index in (0..self.tasks.len()).rev() {
             let Accepted { task, enqueued, reply, .. } = &self.tasks[index];
             let late = task.deadline.filter(|deadline| enqueued.elapsed() >= *deadline);
             let error = match late {
-                _ if load.is_given_up() => stopped(),
-                Some(deadline) => too_late(deadline),
-                None if reply.is_given_up() => stopped(),
+                _ if load.is_aborted() => shutting_down(),
+                Some(deadline) => deadline_exceeded(deadline),
+                None if reply.is_cancelled() => shutting_down(),
                 None => continue,
             };
-            dismissed.push((self.tasks.remove(index), Err(error)));
-            self.ends.remove(index);
+            removed.push((self.tasks.remove(index), Err(error)));
+            self.latents.remove(index);
             self.spans.remove(index);
             self.ongoing.remove(index);
         }
-        dismissed
+        removed
     }
 
     fn resume(&mut self, go_on: &mut dyn FnMut() -> bool) {
-        let queries = queries(&self.tasks, &self.ends);
+        let queries = queries(&self.tasks, &self.latents);
         self.model.model().method.resume(&queries, &mut self.ongoing, go_on);
     }
 
     fn finish(self) -> Vec<(Accepted, Answer)> {
-        let Self { tasks, ends, model, ongoing, encoded, searched, .. } = self;
+        let Self { tasks, latents, model, ongoing, encoded, searched, .. } = self;
         let plans = ongoing.into_plans();
-        let answers = plans.into_iter().zip(queries(&tasks, &ends)).zip(&tasks).map(|((plan, query), accepted)| {
+        let answers = plans.into_iter().zip(queries(&tasks, &latents)).zip(&tasks).map(|((plan, query), accepted)| {
             let times = StageTimes {
                 queue_seconds: accepted.enqueued.elapsed().saturating_sub(encoded + searched).as_secs_f64(),
                 encode_seconds: encoded.as_secs_f64(),
@@ -162,9 +174,9 @@ impl Searching {
     }
 }
 
-/// What is asked of a method.
-fn queries<'a>(tasks: &'a [Accepted], ends: &'a [(Vec<f32>, Vec<f32>)]) -> Vec<Query<'a>> {
-    let queries = tasks.iter().zip(ends);
+/// Queries of the tasks, for the method.
+fn queries<'a>(tasks: &'a [Accepted], latents: &'a [(Vec<f32>, Vec<f32>)]) -> Vec<Query<'a>> {
+    let queries = tasks.iter().zip(latents);
     queries
         .map(|(Accepted { task, .. }, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start })
         .collect()

@@ -1,4 +1,4 @@
-//! The models that are served, with the checkpoints they had before.
+//! Served models, with their retired checkpoints.
 
 use crate::model::Model;
 use lru::LruCache;
@@ -8,14 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use wire::planner::ModelInfo;
 use wire::{Code, Error};
 
-/// The models that are served, by name.
+/// Served models, by name.
 pub(crate) struct Served {
     by_name: BTreeMap<String, Checkpoints>,
     capacity: usize,
     retired_capacity: NonZeroUsize,
 }
 
-/// A model that searches may go on with after it is gone from here.
+/// Shared model, which searches in progress keep alive after it was swapped out.
 #[derive(Debug, Clone)]
 pub(crate) struct Shared(Arc<Mutex<Model>>);
 
@@ -24,32 +24,32 @@ impl Shared {
         Self(Arc::new(Mutex::new(model)))
     }
 
-    /// Whoever has the models has it at once.
+    /// Locks the model; uncontended, since only the thread that owns the models does so.
     pub(crate) fn model(&self) -> MutexGuard<'_, Model> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// A model's checkpoints.
+/// Checkpoints of a model.
 struct Checkpoints {
-    /// Of the one that is current.
+    /// SHA-256 of the current checkpoint, in hex.
     digest: String,
-    /// The one that answers who asks for none.
+    /// Current checkpoint, for requests without a digest.
     current: Shared,
-    /// Those that were swapped out, by digest: an episode that began with one may go on with it.
+    /// Retired checkpoints by digest, for episodes that began with them.
     retired: LruCache<String, Shared>,
 }
 
 impl Served {
-    /// Room for `capacity` names, and for so many checkpoints of each that were swapped out.
+    /// Table of at most `capacity` models, with at most `retired_capacity` retired checkpoints each.
     pub(crate) fn new(capacity: usize, retired_capacity: NonZeroUsize) -> Self {
         Self { by_name: BTreeMap::new(), capacity, retired_capacity }
     }
 
-    /// Serves a model in place of the one of its name, which is kept for those who ask for it.
+    /// Serves a model in place of the one of its name, which is retired.
     ///
     /// # Errors
-    /// `RESOURCE_EXHAUSTED` if the name is new and one too many.
+    /// `RESOURCE_EXHAUSTED` if the name is new and beyond the capacity.
     pub(crate) fn swap_in(&mut self, model: Model) -> Result<(), Error> {
         let ModelInfo { name, digest, .. } = model.info.clone();
         check_capacity(&name, self.by_name.keys(), self.capacity)?;
@@ -67,7 +67,7 @@ impl Served {
         Ok(())
     }
 
-    /// Forgets a model, with all its checkpoints.
+    /// Removes a model with all its checkpoints.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown name.
@@ -76,7 +76,7 @@ impl Served {
         removed.map(drop).ok_or_else(|| unknown_model(name, self.by_name.keys()))
     }
 
-    /// The model of a name, with the checkpoint that must answer, if one must.
+    /// Model of a name and, if there is a `digest`, of that checkpoint, current or retired.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown name; `FAILED_PRECONDITION` for a checkpoint that is not kept.
@@ -96,10 +96,10 @@ impl Served {
     }
 }
 
-/// Whether there is room for a model of this name.
+/// Checks the capacity for a model of this name.
 ///
 /// # Errors
-/// `RESOURCE_EXHAUSTED` if the name is new and one too many.
+/// `RESOURCE_EXHAUSTED` if the name is new and beyond the capacity.
 pub(crate) fn check_capacity<'a>(
     name: &str,
     mut served: impl ExactSizeIterator<Item = &'a String>,
@@ -112,7 +112,7 @@ pub(crate) fn check_capacity<'a>(
     Err(Error::new(Code::ResourceExhausted, "model", expected, name))
 }
 
-/// The named model is not among those served.
+/// Error of a model name that is not served.
 pub(crate) fn unknown_model<'a>(name: &str, served: impl Iterator<Item = &'a String>) -> Error {
     let served: Vec<_> = served.map(String::as_str).collect();
     Error::new(Code::NotFound, "model", format!("one of {}", served.join(", ")), name)

@@ -1,4 +1,4 @@
-//! What becomes of checkpoints that no trusted key signed.
+//! Signature policy: trusted keys, and the treatment of unverified checkpoints.
 
 use crate::config::Config;
 use anyhow::{Context, ensure};
@@ -11,11 +11,10 @@ use tracing::{debug, warn};
 use wire::checkpoint::CheckpointManifest;
 use wire::{Code, Error};
 
-/// End of a checkpoint's file name.
+/// File name extension of checkpoints.
 const CHECKPOINT: &str = "safetensors";
 
-/// The trusted keys, and the policy towards checkpoints that none of them signed. Nothing else of a checkpoint is looked at
-/// before it has passed here.
+/// Trusted keys, and the policy towards checkpoints that none of them signed. A checkpoint is parsed only after it has passed.
 #[derive(Debug)]
 pub(crate) struct Signatures {
     trust: Trust,
@@ -23,10 +22,10 @@ pub(crate) struct Signatures {
 }
 
 impl Signatures {
-    /// Reads the keys that are trusted. If there are any and nothing is said of trust, it is `warn`.
+    /// Reads the trusted keys. Without a configured policy, it is `warn` if there are keys, else `off`.
     ///
     /// # Errors
-    /// If a file of keys cannot be read, or there is no key where one is needed.
+    /// If a file of keys cannot be read or is malformed, or the policy is `warn` or `enforce` without any key.
     pub(crate) fn new(config: &Config) -> anyhow::Result<Self> {
         let mut keys = TrustedKeys::default();
         for path in &config.trusted_keys {
@@ -41,13 +40,13 @@ impl Signatures {
         Ok(Self { trust, keys })
     }
 
-    /// Checks a file of the models folder by the bundle beside it. Blocks.
+    /// Verifies a file of the model folder by the bundle beside it. Blocks.
     ///
     /// # Errors
-    /// `FAILED_PRECONDITION` if no trusted key signed it and that is refused.
+    /// `FAILED_PRECONDITION` if the policy is `enforce` and no trusted key signed the file.
     pub(crate) fn check_file(&self, folder: &Path, name: &str, bytes: &[u8]) -> Result<(), Error> {
-        self.judge(name, || {
-            // One byte more than a bundle may have, so that it is refused as too large.
+        self.apply_policy(name, || {
+            // One byte beyond the limit, so that a larger bundle is refused as too large.
             let beside = format!("{name}.{}", signing::EXTENSION);
             let bundle = match files::read_inside(folder, &beside, signing::MAX_BYTES + 1) {
                 Ok(bundle) => Some(bundle),
@@ -58,26 +57,30 @@ impl Signatures {
         })
     }
 
-    /// Checks a checkpoint that came with no signature.
+    /// Applies the policy to a checkpoint without a signature.
     ///
     /// # Errors
-    /// `FAILED_PRECONDITION` if that is refused.
+    /// `FAILED_PRECONDITION` if the policy is `enforce`.
     pub(crate) fn check_unsigned(&self, model: &str) -> Result<(), Error> {
         let name = file_name(model);
-        self.judge(&name, || self.keys.verify(None, &name, &[]))
+        self.apply_policy(&name, || self.keys.verify(None, &name, &[]))
     }
 
-    /// Checks a published checkpoint by its manifest; that the bytes are of the manifest's digest is not checked here.
+    /// Verifies the signature of a published checkpoint by its manifest; the bytes are compared with the digest elsewhere.
     ///
     /// # Errors
-    /// `FAILED_PRECONDITION` if no trusted key signed it and that is refused.
+    /// `FAILED_PRECONDITION` if the policy is `enforce` and no trusted key signed the checkpoint.
     pub(crate) fn check_published(&self, manifest: &CheckpointManifest) -> Result<(), Error> {
         let name = file_name(&manifest.model);
         let bundle = manifest.signature_bundle.as_deref().map(str::as_bytes);
-        self.judge(&name, || self.keys.verify_digest(bundle, &name, &manifest.digest))
+        self.apply_policy(&name, || self.keys.verify_digest(bundle, &name, &manifest.digest))
     }
 
-    fn judge<'a>(&self, file: &str, verify: impl FnOnce() -> Result<&'a str, signing::Error>) -> Result<(), Error> {
+    fn apply_policy<'a>(
+        &self,
+        file: &str,
+        verify: impl FnOnce() -> Result<&'a str, signing::Error>,
+    ) -> Result<(), Error> {
         if self.trust == Trust::Off {
             return Ok(());
         }
@@ -101,7 +104,7 @@ impl Signatures {
     }
 }
 
-/// Name of a model's checkpoint, where it has no file.
+/// File name that signatures have for a model's checkpoint.
 fn file_name(model: &str) -> String {
     format!("{model}.{CHECKPOINT}")
 }

@@ -1,4 +1,4 @@
-//! A request to plan on its way to the model.
+//! Plan requests in the queue of the model thread, their replies and errors.
 
 use crate::load::Estimate;
 use crate::outbox::Outbox;
@@ -10,40 +10,40 @@ use tracing::Span;
 use wire::planner::{PlanResponse, Search, Solver};
 use wire::{Code, Error, Observation};
 
-/// A request to plan whose names are resolved and whose images are of the right size.
+/// Plan request with resolved names and checked image sizes.
 #[derive(Debug)]
 pub(crate) struct PlanTask {
     pub(crate) model: String,
-    /// The checkpoint that must answer.
+    /// SHA-256 of the required checkpoint, in hex.
     pub(crate) model_digest: Option<String>,
     pub(crate) goal_id: String,
     pub(crate) goal: Arc<Observation>,
-    /// The request's field that the goal came from.
+    /// Name of the request's field with the goal.
     pub(crate) goal_field: &'static str,
     pub(crate) observation: Observation,
     pub(crate) seed: u64,
     pub(crate) deadline: Option<Duration>,
     pub(crate) search: Option<Search>,
-    /// `[H][A]`, or nothing.
+    /// Initial plan, `[H, A]` or empty.
     pub(crate) warm_start: Vec<Vec<f32>>,
-    /// Of the request.
+    /// Tracing span of the request.
     pub(crate) span: Span,
 }
 
-/// A task in the queue.
+/// Task in the queue.
 #[derive(Debug)]
 pub(crate) struct Waiting {
     pub(crate) task: PlanTask,
     pub(crate) enqueued: Instant,
-    /// Of its time in the queue.
+    /// Tracing span of the time in the queue.
     pub(crate) queued: Span,
-    /// Given back when the plan starts or, if it is done in pieces, when it is answered.
+    /// Place in the queue, freed when the plan starts or, for a sliced search, when it is answered.
     pub(crate) place: OwnedSemaphorePermit,
     pub(crate) reply: Reply,
     pub(crate) estimate: Estimate,
 }
 
-/// A task that is being planned for.
+/// Task being planned.
 #[derive(Debug)]
 pub(crate) struct Accepted {
     pub(crate) task: PlanTask,
@@ -53,35 +53,35 @@ pub(crate) struct Accepted {
     pub(crate) _place: Option<OwnedSemaphorePermit>,
 }
 
-/// What a task comes to.
+/// Answer to a task.
 pub(crate) type Answer = Result<PlanResponse, Error>;
 
-/// Where the answer goes.
+/// Destination of an answer.
 pub(crate) enum Reply {
-    /// To who awaits it, or has given up.
-    Awaited(oneshot::Sender<Answer>),
-    /// To what is called with it and may block.
-    Called(Box<dyn FnOnce(Answer) + Send>, Outbox),
+    /// Channel of a caller that awaits the answer; closed if it was cancelled.
+    Channel(oneshot::Sender<Answer>),
+    /// Callback that may block, and the outbox to call it from.
+    Callback(Box<dyn FnOnce(Answer) + Send>, Outbox),
 }
 
 impl PlanTask {
-    /// Whether both can be planned together.
-    pub(crate) fn is_like(&self, other: &Self) -> bool {
+    /// Whether both tasks fit in one batch: same model, checkpoint, search and kind of start.
+    pub(crate) fn is_compatible(&self, other: &Self) -> bool {
         let kind = |task: &Self| (task.search, task.warm_start.is_empty());
         self.model == other.model && self.model_digest == other.model_digest && kind(self) == kind(other)
     }
 
-    /// Whether the plan goes on until its own deadline, so that nobody can share it.
+    /// Whether the search is anytime: it ends with the task's own deadline, and cannot be batched.
     pub(crate) fn is_anytime(&self) -> bool {
         self.search.is_some_and(|search| search.anytime)
     }
 
-    /// Whether plans are tried, so that planning together saves nothing.
+    /// Whether the search samples plans; batching such tasks saves nothing.
     pub(crate) fn is_sampled(&self) -> bool {
         self.search.is_some_and(|search| search.solver != Solver::Gradient)
     }
 
-    /// The request's field that the observation came from.
+    /// Name of the request's field with the observation.
     pub(crate) fn observation_field(&self) -> &'static str {
         match self.observation {
             Observation::Image(_) => "observation",
@@ -89,11 +89,10 @@ impl PlanTask {
         }
     }
 
-    /// A plan is only worth something between pictures of one look, and by a model that learnt from that look. What does
-    /// not say how it was rendered goes with everything.
+    /// Checks that observation, goal and the model's training images have the same render spec; an empty one matches any.
     ///
     /// # Errors
-    /// If two of the three were rendered differently.
+    /// `FAILED_PRECONDITION` if two of the three differ.
     pub(crate) fn check_render_specs(&self, model: &str) -> Result<(), Error> {
         let (observation, goal) = (self.observation.render_spec(), self.goal.render_spec());
         let expected = [model, goal].into_iter().find(|spec| !spec.is_empty()).unwrap_or(observation);
@@ -108,28 +107,28 @@ impl PlanTask {
 }
 
 impl Reply {
-    /// Whether nobody waits for the answer any more.
-    pub(crate) fn is_given_up(&self) -> bool {
-        matches!(self, Self::Awaited(sender) if sender.is_closed())
+    /// Whether the caller no longer awaits the answer.
+    pub(crate) fn is_cancelled(&self) -> bool {
+        matches!(self, Self::Channel(sender) if sender.is_closed())
     }
 
-    /// Whether it may take long to send the answer from the same thread.
+    /// Whether [`Self::send_here`] may block.
     pub(crate) fn may_block(&self) -> bool {
-        matches!(self, Self::Called(..))
+        matches!(self, Self::Callback(..))
     }
 
-    /// Hands the answer over, and does not block.
+    /// Sends the answer without blocking, a callback's by its outbox.
     pub(crate) fn send(self, answer: Answer) {
         match self {
-            Self::Awaited(sender) => drop(sender.send(answer)),
-            Self::Called(call, outbox) => outbox.put(move || call(answer)),
+            Self::Channel(sender) => drop(sender.send(answer)),
+            Self::Callback(call, outbox) => outbox.put(move || call(answer)),
         }
     }
 
-    /// The same without another thread: what is called may block this one.
+    /// Sends the answer on this thread, which a callback may block.
     pub(crate) fn send_here(self, answer: Answer) {
         match self {
-            Self::Called(call, _) => call(answer),
+            Self::Callback(call, _) => call(answer),
             awaited => awaited.send(answer),
         }
     }
@@ -137,38 +136,40 @@ impl Reply {
 
 impl fmt::Debug for Reply {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(if self.is_given_up() { "Reply(given up)" } else { "Reply" })
+        f.write_str(if self.is_cancelled() { "Reply(cancelled)" } else { "Reply" })
     }
 }
 
 impl Waiting {
-    /// When the answer is no longer of use.
+    /// Instant of the deadline.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.task.deadline.map(|deadline| self.enqueued + deadline)
     }
 }
 
-/// A queue of `capacity` has no free place.
+/// Refused: all `capacity` places of the queue are taken.
 pub(crate) fn queue_full(capacity: u16) -> Error {
     Error::new(Code::ResourceExhausted, "queue", "a free place", format!("{capacity} waiting"))
 }
 
-/// Whoever waits so long gets nothing of use.
-pub(crate) fn too_many(deadline: Duration, wait: Duration) -> Error {
+/// Refused: the expected wait exceeds the deadline.
+pub(crate) fn wait_too_long(deadline: Duration, wait: Duration) -> Error {
     let expected = format!("a wait of less than the deadline of {} ms", deadline.as_millis());
     Error::new(Code::ResourceExhausted, "queue", expected, format!("about {} ms", wait.as_millis()))
 }
 
-pub(crate) fn too_late(deadline: Duration) -> Error {
+/// The deadline has passed.
+pub(crate) fn deadline_exceeded(deadline: Duration) -> Error {
     Error::new(Code::DeadlineExceeded, "deadline_ms", format!("an answer within {} ms", deadline.as_millis()), "none")
 }
 
-/// A search that takes so long in any case is not begun.
-pub(crate) fn too_long(deadline: Duration, least: Duration) -> Error {
+/// Refused: the search alone takes longer than the deadline, even at the fastest speed measured.
+pub(crate) fn search_too_long(deadline: Duration, least: Duration) -> Error {
     let expected = format!("one that takes less than the deadline of {} ms", deadline.as_millis());
     Error::new(Code::ResourceExhausted, "search", expected, format!("{} ms or more", least.as_millis()))
 }
 
-pub(crate) fn stopped() -> Error {
+/// Refused: the planner is shutting down.
+pub(crate) fn shutting_down() -> Error {
     Error::new(Code::Unavailable, "planner", "a running planner", "one that is shutting down")
 }

@@ -1,4 +1,4 @@
-//! The planner over zenoh: queryables, announced checkpoints, a liveliness token.
+//! Zenoh transport of the planner: queryables, announced checkpoints, a liveliness token.
 
 use crate::CHANGES;
 use crate::config::Config;
@@ -22,10 +22,10 @@ use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::{Query, Queryable};
 
-/// Announcements that wait while a checkpoint is fetched; the oldest go first.
+/// Capacity for announcements that arrive while a checkpoint is fetched; the oldest are dropped.
 const ANNOUNCEMENTS: usize = 64;
 
-/// The planner's place in the zenoh network.
+/// Zenoh session of the planner, with everything declared on it.
 #[derive(Debug)]
 pub(crate) struct ZenohServer {
     session: Session,
@@ -36,20 +36,21 @@ pub(crate) struct ZenohServer {
 }
 
 impl ZenohServer {
-    /// Joins the others, declares the queryables, follows announcements and, with everything in place, says it is alive.
+    /// Opens the session, declares the queryables, subscribes to announcements and, last, declares the liveliness token.
     ///
     /// # Errors
-    /// If the session cannot be opened, or the name cannot stand in a key or is that of a running planner.
+    /// If the session cannot be opened, or the name is not valid in a key or is that of a running planner.
     pub(crate) async fn start(core: PlannerCore, config: &Config) -> anyhow::Result<Self> {
         let plan = key::planner_plan(&config.name)?;
         ensure!(!plan.is_wild(), "name: expected that of one planner, got {:?}", config.name);
         let session = session::open(&config.session).await?;
         session::claim(&session, &config.session, &key::planner_alive(&config.name)?).await?;
+
         let capacity = config.queue_capacity.get();
         let requests = Requests {
             session: session.clone(),
             core: core.clone(),
-            // More than can wait for the model, so that what clients see is the core's own limit.
+            // More than the model thread's queue, so that clients meet the core's own limit.
             places: Arc::new(Semaphore::new(2 * usize::from(capacity))),
             plans: Arc::new(Semaphore::new(2 * usize::from(capacity))),
             capacity,
@@ -79,6 +80,7 @@ impl ZenohServer {
                 })
                 .await?,
         ];
+
         let subscriber = session
             .declare_subscriber(key::checkpoint_announcement("*")?)
             .with(RingChannel::new(ANNOUNCEMENTS))
@@ -89,22 +91,23 @@ impl ZenohServer {
             while let Ok(sample) = subscriber.recv_async().await {
                 if let Err(error) = follower.follow(&sample.payload().to_bytes()).await {
                     let key = sample.key_expr();
-                    // The old one serves on.
+                    // The model in service stays.
                     CHANGES.refused("announcement", key, &error);
                 }
             }
         }));
+
         let alive = session.liveliness().declare_token(key::planner_alive(&config.name)?);
         let alive = Some(alive.await.map_err(|e| anyhow!(e))?);
         Ok(Self { session, alive, queryables, announcements, requests: requests.tasks })
     }
 
-    /// The connection to the others.
+    /// Monitor of the session's connection.
     pub(crate) fn connection(&self, config: &SessionConfig) -> Connection {
         Connection::follow(&self.session, config)
     }
 
-    /// Takes no more requests and waits for those in flight.
+    /// Stops accepting requests and waits for those in flight.
     pub(crate) async fn drain(&mut self) {
         self.announcements.abort();
         if let Some(alive) = self.alive.take()
@@ -121,7 +124,7 @@ impl ZenohServer {
         self.requests.wait().await;
     }
 
-    /// Leaves the network.
+    /// Closes the session.
     ///
     /// # Errors
     /// If zenoh cannot close the session.
@@ -130,12 +133,12 @@ impl ZenohServer {
     }
 }
 
-/// What every queryable needs.
+/// Shared state of all queryables.
 struct Requests {
     session: Session,
     core: PlannerCore,
     places: Arc<Semaphore>,
-    /// The same for plans, until their answers are sent.
+    /// Places of plan requests, held until their answers are sent.
     plans: Arc<Semaphore>,
     capacity: u16,
     tasks: TaskTracker,
@@ -143,21 +146,23 @@ struct Requests {
 }
 
 impl Requests {
-    /// Declares the queryable of plans. Zenoh's callback puts a request into the model's queue and, if nobody else waits, the
-    /// model's thread sends the answer: a client that is alone would wait for every thread that had to be woken in between. All
-    /// else is sent by threads that may block, as zenoh does for clients that do not read.
+    /// Declares the queryable of plans. Zenoh's callback enqueues the request and, unless another reply is blocked, the model
+    /// thread sends the answer itself, since waking another thread costs latency. All other answers are sent by threads that may
+    /// block, as zenoh does for clients that do not read.
     async fn serve_plans(&self, key: OwnedKeyExpr) -> anyhow::Result<Queryable<()>> {
         let (core, tasks) = (self.core.clone(), self.tasks.clone());
         let (places, capacity, outbox) = (Arc::clone(&self.plans), self.capacity, core.outbox());
         let own = Arc::new(key.clone());
+
         let callback = move |mut query: Query| {
             let own = Arc::clone(&own);
             let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-                // More wait to be sent than a queue holds: the one who asks on and on is to wait.
+                // Sent here, which may block: backpressure on clients with too many unread answers.
                 return reply::<PlanResponse>(&query, &own, Err(queue_full(capacity)));
             };
+
             let (span, request) = (request_span(&query), query::request::<PlanRequest>(&query));
-            // What waits to be sent may be much, and needs it no longer.
+            // Frees the payload, which an answer that waits to be sent no longer needs.
             query.payload_mut().into_iter().for_each(|payload| *payload = ZBytes::new());
             let in_flight = tasks.token();
             let answer = move |plan: Answer| {
@@ -172,7 +177,8 @@ impl Requests {
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }
 
-    /// Declares another queryable, which may be for a change. Zenoh's callback only starts a task: it must not block the network thread.
+    /// Declares another queryable, of a state `change` if there is one. Zenoh's callback only starts a task, since it must not
+    /// block the network thread.
     async fn serve<Q, R, F, S>(
         &self,
         key: OwnedKeyExpr,
@@ -189,6 +195,7 @@ impl Requests {
         let (core, places, capacity) = (core.clone(), Arc::clone(places), *capacity);
         let (tasks, runtime, outbox) = (tasks.clone(), runtime.clone(), core.outbox());
         let own = Arc::new(key.clone());
+
         let callback = move |query: Query| {
             let (outbox, in_flight) = (outbox.clone(), tasks.token());
             let (core, place) = (core.clone(), Arc::clone(&places).try_acquire_owned());
@@ -209,11 +216,12 @@ impl Requests {
             };
             tasks.spawn_on(answer.instrument(span), &runtime);
         };
+
         self.session.declare_queryable(key).complete(true).callback(callback).await.map_err(|e| anyhow!(e))
     }
 }
 
-/// The span of a request, below its sender's.
+/// Tracing span of a request, a child of its sender's.
 fn request_span(query: &Query) -> Span {
     let span = debug_span!("request", otel.kind = "server", key = %query.key_expr());
     trace::follow(&span, query::traceparent(query).as_deref());

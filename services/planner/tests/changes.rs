@@ -1,4 +1,4 @@
-//! Refused changes of state leave a trace: a line in the log and a count.
+//! Refused state changes are logged and counted.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -48,7 +48,7 @@ async fn refused_changes_are_logged_and_counted() {
     common::soon(alive.await.unwrap().recv_async()).await.unwrap();
     let mut remote = PlannerServiceClient::connect(format!("http://{grpc}")).await.unwrap();
 
-    // One refused by its contents, one by its form, one that comes too late to be read.
+    // One refused for its contents, one for its encoding, one because it comes too late to be read.
     Client::Grpc(remote.clone()).load_model(from_bytes("cpn", b"noise".to_vec())).await.unwrap_err();
     remote.load_model(from_file("cpn", "../secret")).await.unwrap_err();
     remote.load_model(from_bytes("cpn", vec![0; 70 << 20])).await.unwrap_err();

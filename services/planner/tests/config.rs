@@ -1,4 +1,4 @@
-//! The layers of the settings.
+//! Layers of the configuration.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -18,7 +18,7 @@ fn load(file: &str, arguments: &[&str]) -> anyhow::Result<Config> {
 }
 
 #[test]
-fn what_is_not_set_is_the_default() {
+fn unset_settings_have_their_defaults() {
     assert_eq!(load("", &[]).unwrap(), Config::default());
 }
 
@@ -41,7 +41,7 @@ fn the_command_line_wins_over_the_file() {
 }
 
 #[test]
-fn openpi_is_listened_to_where_it_is_said() {
+fn openpi_listens_at_the_configured_address() {
     let [file, typed] = ["127.0.0.1:8000", "127.0.0.1:8001"];
     let toml = format!("openpi_listen = '{file}'");
     for (arguments, expected) in [(&[][..], file), (&["--openpi-listen", typed], typed)] {
@@ -50,7 +50,7 @@ fn openpi_is_listened_to_where_it_is_said() {
 }
 
 #[test]
-fn trusted_keys_are_a_list_or_one_text() {
+fn trusted_keys_are_a_list_or_a_string() {
     let none = load("", &[]).unwrap();
     assert_eq!((none.trust, none.trusted_keys.len()), (None, 0));
     let expected = ["a.pem", "b/c.pem"].map(PathBuf::from);

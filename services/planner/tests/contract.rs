@@ -1,4 +1,4 @@
-//! One contract, held against every transport: the same request gets the same answer, whichever way it comes.
+//! Contract of all transports: the same request gets the same answer.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -21,7 +21,7 @@ async fn start() -> Fixture {
     Fixture::start(&checkpoints, |_| ()).await
 }
 
-/// Everything a client sees of a planner that is asked the right questions.
+/// Answers of a planner to valid requests of every kind.
 async fn answers(client: &Client) -> (Vec<PlanResponse>, Vec<ModelInfo>, String) {
     let models = client.list_models().await.unwrap().models;
     let register = proto::RegisterGoalRequest { image: Some(image(0)) };
@@ -72,7 +72,7 @@ async fn every_transport_gives_the_same_answers() {
     fixture.planner.shutdown().await.unwrap();
 }
 
-/// A request, wrong in one respect.
+/// Request with one fault.
 fn spoiled(spoil: impl FnOnce(&mut proto::PlanRequest)) -> proto::PlanRequest {
     let mut request = plan_request("cpn", 3);
     spoil(&mut request);
@@ -138,10 +138,10 @@ async fn every_transport_refuses_alike() {
     }
 }
 
-/// Pictures of different looks never meet: not with each other, not with a model that learnt from another look.
+/// Images with different render specs are refused, also when the model's training images had another.
 #[tokio::test(flavor = "multi_thread")]
-async fn every_transport_keeps_looks_apart() {
-    // As long as real ones: an error has to carry two of them whole.
+async fn every_transport_refuses_mixed_render_specs() {
+    // As long as real ones, since an error must have room for two.
     let [soft, hard] =
         ["soft", "hard"].map(|shadows| format!("{{\"shadows\":\"{shadows}\",\"x\":\"{}\"}}", "x".repeat(300)));
     let checkpoints = [("cpn", checkpoint(MethodKind::Cpn, 1)), ("soft", checkpoint_for(MethodKind::Cpn, 1, &soft))];
@@ -180,7 +180,7 @@ async fn every_transport_keeps_looks_apart() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn grpc_statuses_are_used_as_meant() {
+async fn errors_have_their_grpc_statuses() {
     let fixture = start().await;
     let [_, Client::Grpc(mut grpc), _] = fixture.clients() else { unreachable!() };
     for (request, code) in [
@@ -194,9 +194,9 @@ async fn grpc_statuses_are_used_as_meant() {
     assert_eq!(status.message(), "model: expected a name other than random, got random");
 }
 
-/// Registered goals give way to later ones; a client that is told so registers again.
+/// The least recently used goal is evicted; its client, told so, registers it again.
 #[tokio::test(flavor = "multi_thread")]
-async fn the_oldest_goal_goes_first() {
+async fn the_least_recently_used_goal_is_evicted() {
     let fixture = Fixture::start(&[], |config| config.goal_capacity = 2.try_into().unwrap()).await;
     let [client, ..] = fixture.clients();
     let mut ids = Vec::new();
@@ -211,7 +211,7 @@ async fn the_oldest_goal_goes_first() {
     }
 }
 
-/// Positions go the same ways as pictures, and neither passes for the other.
+/// Plans between positions, over every transport; positions and images are not accepted for each other.
 #[tokio::test(flavor = "multi_thread")]
 async fn every_transport_plans_between_positions() {
     let checkpoints = [("cpn", checkpoint(MethodKind::Cpn, 1)), ("jenga", position_checkpoint(1))];
@@ -252,7 +252,7 @@ async fn every_transport_plans_between_positions() {
         for (request, error) in &cases {
             assert_eq!(client.plan(request.clone()).await.unwrap_err(), *error, "{transport}");
         }
-        // The control takes whatever comes.
+        // The random baseline accepts both.
         client.plan(position_request(RANDOM)).await.unwrap();
     }
     fixture.planner.shutdown().await.unwrap();

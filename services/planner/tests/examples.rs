@@ -1,4 +1,4 @@
-//! The examples: README shows one as it is and links the others, and they work.
+//! Examples: README quotes one verbatim and links the others, and they run.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -10,7 +10,7 @@ use std::process::Command;
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
 
 #[test]
-fn the_readme_shows_one_example_and_links_the_others() {
+fn the_readme_quotes_one_example_and_links_the_others() {
     let read = |file| std::fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
     let readme = read("README.md");
     assert!(readme.contains(&read("examples/plan_zenoh.py")), "README.md: expected the text of examples/plan_zenoh.py");

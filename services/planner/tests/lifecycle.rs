@@ -42,7 +42,7 @@ async fn a_ready_planner_is_healthy_and_describes_itself() {
     }
 }
 
-/// A plan that is being made when the planner is told to stop is finished and answered, on every transport.
+/// A plan in progress at shutdown is finished and answered, on every transport.
 #[tokio::test(flavor = "multi_thread")]
 async fn shutdown_lets_a_plan_finish() {
     for transport in 0..3 {
@@ -66,9 +66,9 @@ async fn shutdown_lets_a_plan_finish() {
     }
 }
 
-/// A load balancer that watches is told, and its open stream does not hold up the end.
+/// A health watcher sees the change, and its open stream does not delay shutdown.
 #[tokio::test(flavor = "multi_thread")]
-async fn shutdown_tells_those_who_watch() {
+async fn shutdown_is_reported_to_health_watchers() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let request = HealthCheckRequest { service: "cpn.v1.PlannerService".into() };
     let mut health = HealthClient::new(fixture.channel.clone()).watch(request).await.unwrap().into_inner();
@@ -106,7 +106,7 @@ async fn without_checkpoints_the_random_model_is_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_folder_that_was_named_must_be_there_and_files_that_come_along_are_nobodys() {
+async fn a_configured_folder_must_exist_and_hidden_files_are_ignored() {
     let models_dir = TempDir::new().unwrap();
     let absent = Config { models_dir: models_dir.path().join("absent"), ..config(&models_dir) };
     let error = format!("{:#}", planner::start(absent).await.unwrap_err());

@@ -1,4 +1,4 @@
-//! Bytes that are no request are refused as the client's fault, and the planner answers the next one.
+//! Malformed requests are refused as the client's fault, and the next one is answered.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -14,7 +14,7 @@ use tonic_prost::ProstCodec;
 use wire::planner::PlanResponse;
 use wire::{Code, Error, key, proto};
 
-/// Bytes that go out as they are, in the place of a message.
+/// Raw bytes in place of a message.
 #[derive(Debug, Default)]
 struct Raw(Vec<u8>);
 
@@ -58,7 +58,7 @@ fn assert_refused(error: Error, what: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_message_is_refused() {
+async fn malformed_messages_are_refused() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let valid = plan_request(RANDOM, 3).encode_to_vec();
     let truncated = valid[..valid.len() / 2].to_vec();
@@ -88,7 +88,7 @@ async fn only_a_checkpoint_may_be_large() {
     assert_refused(error, "more than any checkpoint");
 }
 
-/// What a client sent comes back in the error, within what a gRPC header holds.
+/// An error quotes the client's text, truncated to fit in a gRPC header.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_long_name_is_refused_like_any_other() {
     let fixture = Fixture::start(&[], |_| ()).await;

@@ -1,4 +1,4 @@
-//! The planner as a client of a router: before it is there, when it goes, and when it comes back.
+//! Planner as a client of a router that starts late, stops, and restarts.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -33,7 +33,7 @@ fn client(endpoint: &str) -> SessionConfig {
     SessionConfig { mode: Some(Mode::Client), connect: vec![endpoint.into()], ..SessionConfig::default() }
 }
 
-/// Waits until health says so of a service.
+/// Waits until the health of a service is `expected`.
 async fn healthy(address: SocketAddr, service: &str, expected: ServingStatus) {
     let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect_lazy();
     let mut health = HealthClient::new(channel);
@@ -50,7 +50,7 @@ async fn healthy(address: SocketAddr, service: &str, expected: ServingStatus) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn health_tells_of_the_router_and_the_planner_joins_whenever_it_comes() {
+async fn health_reports_the_router_and_the_planner_joins_a_late_one() {
     let endpoint = format!("tcp/{}", free_address());
     let (address, models) = (free_address(), tempfile::tempdir().unwrap());
     let config = Config {
@@ -94,7 +94,7 @@ async fn health_tells_of_the_router_and_the_planner_joins_whenever_it_comes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn all_planners_answer_a_query_to_all_each_under_its_own_key() {
+async fn all_planners_answer_a_wildcard_query_under_their_own_keys() {
     let endpoint = format!("tcp/{}", free_address());
     let _router = router(&endpoint).await;
     let models = tempfile::tempdir().unwrap();
@@ -111,7 +111,7 @@ async fn all_planners_answer_a_query_to_all_each_under_its_own_key() {
     }
     let asking = service_kit::session::open(&client(&endpoint)).await.unwrap();
     let key = key::planner_list_models("*").unwrap();
-    // As any client asks, without a word of how answers are to be put together.
+    // As any client queries, with zenoh's default consolidation of answers.
     let replies = asking.get(&key).payload(wire::encode(ListModelsRequest)).timeout(TIMEOUT).await.unwrap();
     let mut keys = Vec::new();
     while let Ok(reply) = soon(replies.recv_async()).await {
@@ -124,7 +124,7 @@ async fn all_planners_answer_a_query_to_all_each_under_its_own_key() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn zenohs_own_file_and_passwords_are_heeded() {
+async fn zenohs_own_file_and_passwords_are_applied() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| {
         let path = folder.path().join(name);
@@ -149,7 +149,7 @@ async fn zenohs_own_file_and_passwords_are_heeded() {
     assert!(joins("secret\n", common::PATIENCE).await);
     assert!(!joins("guessed", TIMEOUT).await);
 
-    // What is given wins over the file; what the file lacks is zenoh's default, which listens everywhere.
+    // Options win over the file; settings missing in the file are zenoh's defaults, which listen on all interfaces.
     let file = write("peer.json5", "{ scouting: { multicast: { enabled: false } } }");
     let config = SessionConfig { zenoh_config: Some(file), ..SessionConfig::default() };
     let error = service_kit::session::open(&config).await.unwrap_err().to_string();

@@ -1,4 +1,4 @@
-//! The planner as a server of openpi: the answers of the core, and a connection that outlives wrong requests.
+//! Transport of openpi's protocol: the answers of the core, and connections that outlive invalid requests.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -19,14 +19,14 @@ use tokio_tungstenite::tungstenite::{Error as SocketError, Message};
 use tokio_tungstenite::{WebSocketStream, client_async};
 use wire::planner::PlanResponse;
 
-/// The most connections that are served.
+/// Maximum number of clients.
 const MAX_CONNECTIONS: usize = 64;
 
 async fn start(checkpoints: &[(&str, Vec<u8>)]) -> Fixture {
     Fixture::start(checkpoints, |config| config.openpi_listen = Some(([127, 0, 0, 1], 0).into())).await
 }
 
-/// A client that has read the metadata.
+/// Client that has read the metadata.
 struct Client {
     socket: WebSocketStream<TcpStream>,
     metadata: Value,
@@ -52,7 +52,7 @@ impl Client {
         soon(self.socket.next()).await.unwrap().unwrap()
     }
 
-    /// A plan, or the text of an error.
+    /// Sends a request; returns the plan, or the text of an error.
     async fn infer(&mut self, message: impl Into<Message>) -> Result<Value, String> {
         self.send(message.into()).await;
         match self.receive().await {
@@ -94,7 +94,7 @@ fn position([x, y, z]: [f32; 3]) -> Value {
     array("<f4", &[3], [x.to_le_bytes(), y.to_le_bytes(), z.to_le_bytes()].concat())
 }
 
-/// The request that [`plan_request`] is.
+/// Fields of the request equivalent to [`plan_request`].
 fn request(model: &str, seed: u64) -> [(&str, Value); 4] {
     [("observation/image", picture(seed)), ("goal/image", picture(0)), ("model", model.into()), ("seed", seed.into())]
 }
@@ -109,7 +109,7 @@ fn keys(value: &Value) -> Vec<&str> {
     value.as_map().unwrap().iter().map(|(key, _)| key.as_str().unwrap()).collect()
 }
 
-/// Demands that an answer over openpi is the core's, bit for bit, with the actions clipped.
+/// Asserts that an answer over openpi is the core's, bit for bit, with the actions clipped.
 fn assert_same(answer: &Value, plan: &PlanResponse) {
     let actions = field(answer, "actions");
     assert_eq!(*field(actions, "__ndarray__"), true.into());
@@ -130,7 +130,7 @@ fn assert_same(answer: &Value, plan: &PlanResponse) {
     }
 }
 
-/// A method whose actions are out of bounds.
+/// Method with actions out of bounds.
 fn far() -> Box<dyn Method> {
     let plan = || Plan { actions: vec![vec![0.5, -0.5, 7.0, -7.0]; 2], inner_losses: Vec::new(), iterations: 0 };
     method(move |queries| queries.iter().map(|_| plan()).collect())
@@ -173,15 +173,15 @@ async fn openpi_gets_the_answers_of_the_core() {
     fixture.planner.shutdown().await.unwrap();
 }
 
-/// A number or text of numpy's own types, as openpi's client packs it.
+/// Numpy scalar, as openpi's client packs it.
 fn generic(dtype: &str, data: impl Into<Value>) -> Value {
     let key = |name: &str| Value::from(name.as_bytes());
     Value::Map(vec![(key("__npgeneric__"), true.into()), (key("data"), data.into()), (key("dtype"), dtype.into())])
 }
 
-/// Every form in which Python programs hold a number, a text or nothing.
+/// All Python and numpy forms of numbers, text and None.
 #[tokio::test(flavor = "multi_thread")]
-async fn scalars_come_in_all_their_forms() {
+async fn scalars_of_all_forms_are_accepted() {
     let fixture = start(&[("cpn", checkpoint(MethodKind::Cpn, 1))]).await;
     let [core, ..] = fixture.clients();
     let mut client = Client::of(&fixture).await;
@@ -233,7 +233,7 @@ async fn scalars_come_in_all_their_forms() {
     }
 }
 
-/// What an HTTP client gets.
+/// Response to an HTTP client.
 async fn http(address: SocketAddr, request: &str) -> String {
     let mut stream = TcpStream::connect(address).await.unwrap();
     stream.write_all(request.as_bytes()).await.unwrap();
@@ -243,14 +243,14 @@ async fn http(address: SocketAddr, request: &str) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn health_is_told_as_by_servers_of_openpi() {
+async fn health_checks_are_answered_as_by_openpis_server() {
     let fixture = start(&[]).await;
     let address = fixture.planner.openpi_address().unwrap();
     let well = http(address, "GET /healthz HTTP/1.1\r\nHost: planner\r\n\r\n").await;
     assert!(well.starts_with("HTTP/1.1 200 OK\r\n") && well.ends_with("\r\n\r\nOK\n"), "{well}");
     let refused = http(address, "GET / HTTP/1.1\r\nHost: planner\r\n\r\n").await;
     assert!(refused.starts_with("HTTP/1.1 400 Bad Request\r\n"), "{refused}");
-    // A head without an end is read no further than to its limit.
+    // An endless head is read up to its limit.
     let mut stream = TcpStream::connect(address).await.unwrap();
     let endless = format!("GET /{} HTTP/1.1\r\n", "x".repeat(32 << 10));
     let _ = stream.write_all(endless.as_bytes()).await;
@@ -266,7 +266,7 @@ async fn the_only_model_need_not_be_named() {
     assert_same(&answer, &plan);
 }
 
-/// The fields of a good request, one of them changed, added or, with nil, left out.
+/// Fields of a valid request, with one changed, added or, with nil, left out.
 fn spoiled(name: &'static str, value: Value) -> Vec<u8> {
     let mut fields = request("cpn", 3).to_vec();
     fields.retain(|(field, _)| *field != name);
@@ -277,7 +277,7 @@ fn spoiled(name: &'static str, value: Value) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn wrong_requests_are_refused_and_the_next_is_answered() {
+async fn invalid_requests_are_refused_and_the_next_is_answered() {
     let checkpoints = [
         ("bc", checkpoint(MethodKind::Bc, 1)),
         ("cpn", checkpoint(MethodKind::Cpn, 1)),
@@ -380,9 +380,9 @@ async fn wrong_requests_are_refused_and_the_next_is_answered() {
     }
 }
 
-/// What is no message of openpi is refused, whatever it claims to be, and the connection serves on.
+/// Malformed messages are refused, and the connection stays usable.
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_message_is_refused() {
+async fn malformed_messages_are_refused() {
     let fixture = start(&[]).await;
     let mut client = Client::of(&fixture).await;
     let valid = packed(&request(RANDOM, 3));
@@ -423,13 +423,13 @@ async fn a_message_that_is_too_large_ends_its_connection_with_the_reason() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_speaks_no_websocket_or_leaves_midway_disturbs_nobody() {
+async fn clients_without_websocket_or_that_leave_midway_do_not_disturb_others() {
     let fixture = start(&[]).await;
     let address = fixture.planner.openpi_address().unwrap();
     let mut client = Client::of(&fixture).await;
     for bytes in [&b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"[..], &[0xff; 100_000]] {
         let mut stream = TcpStream::connect(address).await.unwrap();
-        // The planner may hang up before it has read all of it.
+        // The planner may close the connection before it has read everything.
         let _ = stream.write_all(bytes).await;
         let mut answer = Vec::new();
         let _ = soon(stream.read_to_end(&mut answer)).await;
@@ -439,7 +439,7 @@ async fn who_speaks_no_websocket_or_leaves_midway_disturbs_nobody() {
     leaving.send(packed(&request(RANDOM, 3)).into()).await;
     drop(leaving);
     let mut midway = Client::of(&fixture).await;
-    // The beginning of a masked binary frame of 64 bytes.
+    // Begin of a masked binary frame of 64 bytes.
     midway.socket.get_mut().write_all(&[0x82, 0x80 | 64, 1, 2, 3, 4, 5]).await.unwrap();
     drop(midway);
     client.infer(packed(&request(RANDOM, 3))).await.unwrap();
@@ -447,7 +447,7 @@ async fn who_speaks_no_websocket_or_leaves_midway_disturbs_nobody() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn connections_are_bounded_and_places_are_given_back() {
+async fn connections_are_bounded_and_places_are_freed() {
     let fixture = start(&[]).await;
     let address = fixture.planner.openpi_address().unwrap();
     let mut clients = Vec::new();
@@ -469,9 +469,9 @@ async fn connections_are_bounded_and_places_are_given_back() {
     soon(again).await.unwrap().infer(packed(&request(RANDOM, 3))).await.unwrap();
 }
 
-/// A plan that is being made when the planner is told to stop is finished and sent, and every client is told.
+/// A plan in progress at shutdown is finished and sent, and every client gets a close frame.
 #[tokio::test(flavor = "multi_thread")]
-async fn shutdown_lets_a_plan_finish_and_says_goodbye() {
+async fn shutdown_lets_a_plan_finish_and_closes_connections() {
     let fixture = start(&[]).await;
     let gate = Gate::serve(&fixture.planner.core()).await;
     let (mut planning, mut idle) = (Client::of(&fixture).await, Client::of(&fixture).await);

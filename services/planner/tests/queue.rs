@@ -1,4 +1,4 @@
-//! The model thread under load and under fault, with a method that waits until the test lets it on.
+//! Model thread under load and faults, with a method that waits for the test.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -17,7 +17,7 @@ use wire::{Code, Error, proto};
 
 type Answer = Pin<Box<dyn Future<Output = Result<PlanResponse, Error>> + Send>>;
 
-/// Puts a plan in the queue; its answer is awaited later, or dropped.
+/// Queues a plan; its answer is awaited later, or dropped.
 async fn enqueue(core: &PlannerCore, request: proto::PlanRequest) -> Answer {
     let core = core.clone();
     let request = PlanRequest::try_from(request).unwrap();
@@ -41,7 +41,7 @@ async fn a_full_queue_refuses_and_recovers() {
         let error = client.plan(plan_request(RANDOM, 4)).await.unwrap_err();
         let full = Error::new(Code::ResourceExhausted, "queue", "a free place", "2 waiting");
         assert_eq!(error, full, "{}", client.transport());
-        // What needs no plan is answered all the same.
+        // Requests without a plan are still answered.
         client.register_goal(proto::RegisterGoalRequest { image: Some(image(9)) }).await.unwrap();
         client.list_models().await.unwrap();
     }
@@ -77,7 +77,7 @@ async fn a_full_queue_does_not_hinder_a_swap() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_deadline_that_passes_in_the_queue_is_told_and_not_planned() {
+async fn a_deadline_that_passes_in_the_queue_is_answered_without_a_plan() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     let gate = Gate::serve(&core).await;
@@ -97,9 +97,9 @@ async fn a_deadline_that_passes_in_the_queue_is_told_and_not_planned() {
     next.await.unwrap();
 }
 
-/// A deadline holds for a plan that is being made, too.
+/// A deadline also holds during planning.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_plan_that_takes_too_long_is_given_up() {
+async fn a_plan_beyond_its_deadline_is_answered_with_an_error() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     let gate = Gate::serve(&core).await;
@@ -114,7 +114,7 @@ async fn a_plan_that_takes_too_long_is_given_up() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn clients_that_give_up_do_not_disturb() {
+async fn cancelled_requests_do_not_disturb_others() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     let gate = Gate::serve(&core).await;
@@ -142,7 +142,7 @@ async fn a_failing_plan_fails_alone() {
     }
 }
 
-/// Puts requests in the queue while the model is busy, lets it on, and answers how many were planned at once.
+/// Queues requests while the model is busy, releases it, and returns the batch sizes and the answers.
 async fn planned_together(fixture: &Fixture, requests: Vec<proto::PlanRequest>) -> (Vec<usize>, Vec<PlanResponse>) {
     let core = fixture.planner.core();
     let (sender, counts) = mpsc::channel();
@@ -165,9 +165,9 @@ async fn planned_together(fixture: &Fixture, requests: Vec<proto::PlanRequest>) 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_waits_is_planned_together() {
+async fn queued_requests_are_planned_in_batches() {
     let fixture = Fixture::start(&[], |config| config.batch_size = 4.try_into().unwrap()).await;
-    // Those for another model in between do not part them; one more than fits waits for the next batch.
+    // Requests for another model in between do not split a batch; one beyond the batch size waits for the next.
     let models = ["counting", RANDOM, "counting", "counting", RANDOM, "counting", "counting"];
     let requests: Vec<_> = models.iter().zip(0..).map(|(model, seed)| plan_request(model, seed)).collect();
     let (counts, together) = planned_together(&fixture, requests.clone()).await;
@@ -180,7 +180,7 @@ async fn what_waits_is_planned_together() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_batch_fails_one_by_one() {
+async fn only_the_faulty_request_of_a_batch_fails() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     common::serve(&core, "faulty", faulty()).await;
@@ -196,7 +196,7 @@ async fn a_batch_fails_one_by_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_would_be_late_is_refused_at_once() {
+async fn a_request_that_would_miss_its_deadline_is_refused_at_once() {
     let fixture = Fixture::start(&[], |_| ()).await;
     let core = fixture.planner.core();
     let gate = Gate::serve(&core).await;
@@ -204,7 +204,7 @@ async fn who_would_be_late_is_refused_at_once() {
         let slow = enqueue(&core, plan_request("gated", seed)).await;
         assert_eq!(gate.entered().await, seed);
         if seed == 2 {
-            // By the first plan, one takes longer than this.
+            // Below the measured time of the first plan.
             for client in fixture.clients() {
                 let request = proto::PlanRequest { deadline_ms: 50, ..plan_request("gated", 3) };
                 is(Code::ResourceExhausted, "queue", client.plan(request).await);

@@ -1,4 +1,4 @@
-//! Searches that a request chooses, over every transport.
+//! Searches chosen by requests, over every transport.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -31,7 +31,7 @@ async fn fixture() -> Fixture {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_solver_repeats_itself_and_starts_where_it_is_told() {
+async fn every_solver_is_deterministic_and_uses_the_warm_start() {
     let fixture = fixture().await;
     for solver in SOLVERS {
         let request = proto::PlanRequest { search: search(solver, 3, false), ..plan_request("cpn", 3) };
@@ -44,7 +44,7 @@ async fn every_solver_repeats_itself_and_starts_where_it_is_told() {
             assert_eq!(&plan, first.get_or_insert(plan.clone()), "{solver:?} over {}", client.transport());
             let on = proto::PlanRequest { warm_start: actions(&plan.actions), ..request.clone() };
             let on = client.plan(on).await.unwrap();
-            // Its last inner loss is the one that the next search begins with.
+            // The last inner loss is the first of a search warm-started from this plan.
             assert_eq!(on.inner_losses[0], plan.inner_losses[3], "{solver:?} over {}", client.transport());
         }
     }
@@ -70,7 +70,7 @@ async fn an_anytime_search_uses_its_time_and_can_be_repeated() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_cannot_be_searched_is_refused() {
+async fn invalid_searches_are_refused() {
     let fixture = fixture().await;
     for client in fixture.clients() {
         let refused = async |spoil: &dyn Fn(&mut proto::PlanRequest), model: &str| {
@@ -94,7 +94,7 @@ async fn what_cannot_be_searched_is_refused() {
     }
 }
 
-/// A search that takes seconds at least.
+/// Search that takes at least seconds.
 fn long(solver: Solver) -> proto::PlanRequest {
     let samples = if solver == Solver::Gradient { 0 } else { 4096 };
     let search = proto::Search { solver: solver.into(), iterations: Some(1000), samples, anytime: false };
@@ -112,10 +112,9 @@ async fn a_search_that_cannot_meet_its_deadline_is_refused_at_once() {
     }
 }
 
-/// While a search goes on that takes long, others are planned for and models are swapped; the search comes to the same plan as
-/// without them.
+/// During a long search other requests are planned and models swapped; the search finds the same plan as without them.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_long_search_holds_nobody_up() {
+async fn a_long_search_does_not_delay_other_requests() {
     let fixture = fixture().await;
     let [_, grpc, _] = fixture.clients();
     let mut moderate = long(Solver::Cem);
@@ -132,7 +131,7 @@ async fn a_long_search_holds_nobody_up() {
             client.plan(plan_request(RANDOM, seed)).await.unwrap();
         }
         client.load_model(from_bytes("te-bc", checkpoint(MethodKind::TeBc, 2))).await.unwrap();
-        // What goes on keeps its checkpoint, though more are swapped in than are kept.
+        // The search keeps its checkpoint, even when more are swapped in than are retired.
         for seed in 2..7 {
             client.load_model(from_bytes("cpn", checkpoint(MethodKind::Cpn, seed))).await.unwrap();
         }
@@ -143,7 +142,7 @@ async fn a_long_search_holds_nobody_up() {
     endless.abort();
 }
 
-/// A method whose searches never end, and which counts their pieces.
+/// Method with endless searches, which counts their slices.
 struct Endless(Arc<AtomicU64>);
 
 impl Method for Endless {
@@ -185,7 +184,7 @@ impl Method for Endless {
     }
 }
 
-/// Waits until no piece is done any more.
+/// Waits until no more slices are run.
 async fn has_ended(pieces: &AtomicU64) {
     let mut before = pieces.load(Ordering::Relaxed);
     let ended = async {
@@ -228,7 +227,7 @@ async fn a_search_ends_with_its_deadline_and_with_its_client() {
     }
 }
 
-/// So many searches go on at the same time as half of the queue holds, and a planner that stops waits for none of them for ever.
+/// At most half of the queue's capacity of sliced searches are in progress, and shutdown aborts them.
 #[tokio::test(flavor = "multi_thread")]
 async fn searches_are_bounded_and_do_not_outlast_the_planner() {
     let fixture = Fixture::start(&[], |config| config.queue_capacity = 3.try_into().unwrap()).await;

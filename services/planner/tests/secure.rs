@@ -1,5 +1,4 @@
-//! The planner's listeners with TLS: clients are let in by role, and the others get a clear refusal, a line in the log and a
-//! count.
+//! Listeners with TLS: clients are authorised by role; refusals are clear, logged and counted.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -35,7 +34,7 @@ const METRICS: &str = "127.0.0.1:17499";
 const LOOPBACK: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 const ANYWHERE: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 
-/// A planner that listens with TLS, and its network's authority.
+/// Planner that listens with TLS, and its network's authority.
 struct Secure {
     files: TempDir,
     _models: TempDir,
@@ -85,7 +84,7 @@ impl Secure {
         }
     }
 
-    /// A channel that shows a certificate, or none.
+    /// Channel with a client certificate, or without.
     async fn channel(&self, identity: Option<&str>) -> Result<Channel, tonic::transport::Error> {
         let read = |path: &Path| std::fs::read(path).unwrap();
         let mut tls = ClientTlsConfig::new()
@@ -99,7 +98,7 @@ impl Secure {
         Channel::from_shared(url).unwrap().tls_config(tls).unwrap().connect().await
     }
 
-    /// The answers to a request that a client may make, and to one that only an operator may.
+    /// Status codes of a request that clients may make, and of one that only operators may.
     async fn codes(&self, identity: Option<&str>, token: Option<&str>) -> [Code; 2] {
         let mut planner = PlannerServiceClient::new(self.channel(identity).await.unwrap());
         let load = proto::LoadModelRequest {
@@ -123,7 +122,7 @@ impl Secure {
         let mut stream = self.stream(METRICS.parse().unwrap(), identity).await;
         stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").await.unwrap();
         let mut answer = String::new();
-        // The server may end the stream without a word of TLS's.
+        // The server may end the stream without TLS's close notification.
         let _ = stream.read_to_string(&mut answer).await;
         answer
     }
@@ -138,22 +137,22 @@ fn authorize<T>(mut request: Request<T>, token: Option<&str>) -> Request<T> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn clients_are_let_in_by_their_roles() {
+async fn clients_are_authorised_by_role() {
     let secure = Secure::start().await;
     let token = std::fs::read_to_string(secure.files.path().join("token")).unwrap();
     let missing = [Code::Unauthenticated; 2];
-    // The file that the operator names is not there.
+    // The file that the operator names does not exist.
     assert_eq!(secure.codes(Some("operator"), None).await, [Code::Ok, Code::NotFound]);
     assert_eq!(secure.codes(Some("client"), None).await, [Code::Ok, Code::PermissionDenied]);
     assert_eq!(secure.codes(Some("worker"), None).await, [Code::PermissionDenied; 2]);
     assert_eq!(secure.codes(None, Some(&token)).await, [Code::Ok, Code::PermissionDenied]);
     assert_eq!(secure.codes(None, Some("guessed")).await, missing);
     assert_eq!(secure.codes(None, None).await, missing);
-    // Orchestrators ask for health without credentials.
+    // Orchestrators check health without credentials.
     let mut health = HealthClient::new(secure.channel(None).await.unwrap());
     health.check(HealthCheckRequest { service: "zenoh".into() }).await.unwrap();
 
-    // Whose certificate is revoked gets no connection, and who does not encrypt neither.
+    // Neither a revoked certificate nor plain text gets a connection.
     let gone = secure.channel(Some("operator.gone")).await;
     let asked = match gone {
         Ok(channel) => PlannerServiceClient::new(channel).list_models(proto::ListModelsRequest {}).await.map(drop),
@@ -167,7 +166,7 @@ async fn clients_are_let_in_by_their_roles() {
     };
     assert!(asked.is_err());
 
-    // openpi's client bears its key.
+    // openpi's client sends its token as an API key.
     let address = secure.planner.openpi_address().unwrap();
     for (key, expected) in [(Some(token.as_str()), 101), (Some("guessed"), 401), (None, 403)] {
         let mut request = format!("wss://localhost:{}", address.port()).into_client_request().unwrap();

@@ -1,4 +1,4 @@
-//! What Prometheus finds of signatures. In a process of its own: nothing else is counted there.
+//! Prometheus metrics of signatures, in a process of their own, so that no other test counts.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -14,7 +14,7 @@ use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-/// The samples of a counter, as Prometheus asks for them.
+/// Scraped samples of a counter.
 async fn scrape(address: &str, name: &str) -> Vec<String> {
     let mut stream = TcpStream::connect(address).await.unwrap();
     let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");

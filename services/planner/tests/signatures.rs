@@ -1,4 +1,4 @@
-//! Checkpoints that no trusted key signed are refused, or served with a warning, whichever way they come in.
+//! Unverified checkpoints are refused, or served with a warning, from every source.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -22,15 +22,16 @@ use wire::{Code, key, query};
 use zenoh::Session;
 use zenoh::query::Queryable;
 
-/// Who is trusted here.
+/// Seed of the trusted key.
 const OURS: u8 = 1;
+/// Seed of another key.
 const STRANGER: u8 = 2;
 
 fn cpn(seed: u64) -> Vec<u8> {
     checkpoint(MethodKind::Cpn, seed)
 }
 
-/// A file with our public key.
+/// Writes a file with the trusted public key.
 fn trusted_keys(folder: &Path) -> Vec<PathBuf> {
     let path = folder.join("ours.pub.pem");
     std::fs::write(&path, public_key(OURS)).unwrap();
@@ -44,7 +45,7 @@ fn write(folder: &Path, file: &str, bytes: &[u8], bundle: Option<&str>) {
     }
 }
 
-/// A planner that serves `cpn`, signed by us, from the start.
+/// Starts a planner with the model `cpn`, signed by the trusted key.
 async fn start(trust: Option<Trust>, keys: &TempDir) -> Fixture {
     let trusted_keys = trusted_keys(keys.path());
     Fixture::start(&[("cpn", cpn(1))], |config| {
@@ -54,7 +55,7 @@ async fn start(trust: Option<Trust>, keys: &TempDir) -> Fixture {
     .await
 }
 
-/// Why a planner of this folder does not start.
+/// Error of starting a planner of this folder.
 async fn no_start(models_dir: &Path, trust: Option<Trust>, trusted_keys: Vec<PathBuf>) -> String {
     let config = Config {
         models_dir: models_dir.into(),
@@ -67,7 +68,7 @@ async fn no_start(models_dir: &Path, trust: Option<Trust>, trusted_keys: Vec<Pat
     format!("{:#}", planner::start(config).await.unwrap_err())
 }
 
-/// Bundles for a checkpoint that do not make it ours, and what is said of each.
+/// Invalid bundles for a checkpoint, each with a part of its error.
 fn wrong_bundles(bytes: &[u8]) -> [(Option<String>, &'static str); 5] {
     let good = bundle(OURS, bytes);
     [
@@ -91,7 +92,7 @@ async fn every_checkpoint_of_the_folder_is_checked_at_the_start() {
         let expected = format!("checkpoint {}: {reason}", folder.path().join("b.safetensors").display());
         assert!(error.starts_with(&expected), "expected {expected}…, got {error}");
 
-        // A warning is all that comes of it otherwise, and without keys not even that.
+        // Otherwise it is only warned of, and without keys not even that.
         for (trust, keys) in [
             (Some(Trust::Warn), &trusted_keys[..]),
             (None, &trusted_keys),
@@ -128,7 +129,7 @@ async fn wrong_settings_are_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_to_be_loaded_is_checked() {
+async fn loaded_checkpoints_are_verified() {
     let keys = TempDir::new().unwrap();
     let fixture = start(Some(Trust::Enforce), &keys).await;
     let folder = fixture.models_dir.path();
@@ -144,7 +145,7 @@ async fn what_is_to_be_loaded_is_checked() {
                 assert!(error.to_string().starts_with(reason), "{transport}: {error}");
             }
         }
-        // No signature comes with bytes.
+        // Bytes come without a signature.
         let error = client.load_model(from_bytes("cpn", bytes.clone())).await.unwrap_err();
         assert_eq!(error.to_string(), "signature: expected a bundle for cpn.safetensors, got none", "{transport}");
         assert_eq!(client.list_models().await.unwrap(), before, "{transport}");
@@ -158,7 +159,7 @@ async fn what_is_to_be_loaded_is_checked() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_to_be_loaded_is_served_with_a_warning() {
+async fn unverified_loaded_checkpoints_are_served_with_a_warning() {
     let keys = TempDir::new().unwrap();
     let fixture = start(None, &keys).await;
     let [client, ..] = fixture.clients();
@@ -169,7 +170,7 @@ async fn what_is_to_be_loaded_is_served_with_a_warning() {
     }
 }
 
-/// Serves the pieces of one checkpoint, whatever is asked for; counts how often it is asked.
+/// Serves the chunks of one checkpoint for any digest, and counts the requests.
 async fn publish(session: &Session, bytes: Vec<u8>) -> (Queryable<()>, Arc<AtomicUsize>) {
     let runtime = tokio::runtime::Handle::current();
     let asked = Arc::new(AtomicUsize::new(0));
@@ -223,7 +224,7 @@ async fn served(client: &Client, model: &str, version: u32) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_announced_is_checked_before_it_is_fetched() {
+async fn announced_checkpoints_are_verified_before_they_are_fetched() {
     let keys = TempDir::new().unwrap();
     let fixture = start(Some(Trust::Enforce), &keys).await;
     let [client, ..] = fixture.clients();
@@ -233,7 +234,7 @@ async fn what_is_announced_is_checked_before_it_is_fetched() {
     for (wrong, _) in wrong_bundles(&bytes) {
         announce(&fixture.session, manifest("cpn", 2, &bytes, wrong)).await;
     }
-    // Announcements are heeded in order: once this one is, the others were.
+    // Announcements are processed in order: once this one is served, the others were processed.
     let good = bundle(OURS, &bytes);
     announce(&fixture.session, manifest("marker", 1, &bytes, Some(good.clone()))).await;
     served(&client, "marker", 1).await;
@@ -242,12 +243,12 @@ async fn what_is_announced_is_checked_before_it_is_fetched() {
     after.models.retain(|info| info.name != "marker");
     assert_eq!(after, before);
 
-    // The very version that was refused is served once its signature comes.
+    // The refused version is served once its signature is announced.
     announce(&fixture.session, manifest("cpn", 2, &bytes, Some(good))).await;
     served(&client, "cpn", 2).await;
     assert_eq!(client.digest("cpn").await, cpn::checkpoint::digest(&bytes));
 
-    // A good signature does not excuse other bytes.
+    // A valid signature of other bytes is refused.
     let lie = manifest("cpn", 3, &cpn(3), Some(bundle(OURS, &cpn(3))));
     announce(&fixture.session, lie).await;
     announce(&fixture.session, manifest("marker", 2, &bytes, Some(bundle(OURS, &bytes)))).await;
@@ -256,7 +257,7 @@ async fn what_is_announced_is_checked_before_it_is_fetched() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_announced_is_served_with_a_warning() {
+async fn unverified_announced_checkpoints_are_served_with_a_warning() {
     let keys = TempDir::new().unwrap();
     for trust in [Trust::Warn, Trust::Off] {
         let fixture = start(Some(trust), &keys).await;

@@ -1,5 +1,5 @@
-//! Everything at once, for a while: plans, goals, swaps, malformed requests and clients that vanish, against a planner in a
-//! process of its own. No valid request may fail, and memory may not grow.
+//! Soak test: plans, goals, swaps, malformed requests and vanishing clients at once, against a planner in a process of its own.
+//! No valid request may fail, and memory may not grow.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -27,23 +27,23 @@ use zenoh::Session;
 
 const NAME: &str = "soaked";
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// Between the first tenth of the long run and its end.
+/// Largest growth of memory between a tenth of the long run and its end.
 const MOST_GROWTH_BYTES: u64 = 20 << 20;
 
-/// Memory that a process uses, in bytes.
+/// Resident memory of a process, in bytes.
 fn resident_bytes(process: &Process) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{}/status", process.0.id())).unwrap();
     let line = status.lines().find(|line| line.starts_with("VmRSS")).unwrap();
     line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
 }
 
-/// What every client has.
+/// Shared state of all clients.
 #[derive(Clone)]
 struct Load {
     config: SessionConfig,
     grpc: String,
     end: Instant,
-    /// What was done, by kind.
+    /// Numbers of requests, by kind.
     done: Arc<BTreeMap<&'static str, AtomicU64>>,
 }
 
@@ -65,7 +65,7 @@ impl Load {
     }
 }
 
-/// Some request that must be answered: any goal, any search.
+/// Random valid request, with any goal and search.
 fn valid(rng: &mut ChaCha8Rng) -> proto::PlanRequest {
     let model = if rng.random_bool(0.8) { "cpn" } else { "te-bc" };
     let search = (model == "cpn" && rng.random_bool(0.3)).then(|| proto::Search {
@@ -156,7 +156,7 @@ async fn vanishing(load: Load, mut rng: ChaCha8Rng) {
     }
 }
 
-/// Runs the load; answers the memory in use at a tenth of the time and at the end.
+/// Runs the load; returns the resident memory at a tenth of the time and at the end.
 async fn soak(duration: Duration) -> (u64, u64) {
     let folder = tempfile::tempdir().unwrap();
     for (name, method) in [("cpn", MethodKind::Cpn), ("te-bc", MethodKind::TeBc)] {

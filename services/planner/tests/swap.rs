@@ -1,4 +1,4 @@
-//! A model is replaced between two plans, by a sound one only, and no request notices more than the digest.
+//! Swaps of models: between two plans, only for valid checkpoints, and invisible to requests except for the digest.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -22,7 +22,7 @@ fn cpn(seed: u64) -> Vec<u8> {
     checkpoint(MethodKind::Cpn, seed)
 }
 
-/// A checkpoint whose contents `spoil` has made wrong.
+/// Checkpoint whose contents `spoil` has made invalid.
 fn spoiled(spoil: impl FnOnce(&mut Tensors, &mut serde_json::Value)) -> Vec<u8> {
     let (mut tensors, mut metadata) = archive::from_bytes(&cpn(1)).unwrap();
     spoil(&mut tensors, &mut metadata);
@@ -35,7 +35,7 @@ async fn a_faulty_checkpoint_changes_nothing() {
     let truncated = cpn(2)[..1000].to_vec();
     let wrong_shape = spoiled(|_, metadata| metadata["model"]["hidden"] = 9.into());
     let not_a_number = spoiled(|tensors, _| drop(tensors.insert("step_size".into(), Tensor::new(&[], &[f32::NAN]))));
-    // Every weight is finite, the embedding of a white image is not.
+    // All weights are finite, but the embedding of a white image is not.
     let overflowing = spoiled(|tensors, _| {
         let weight = tensors.iter_mut().find(|(name, _)| name.starts_with("encoder.") && name.ends_with("weight"));
         let weight = weight.unwrap().1;
@@ -59,7 +59,7 @@ async fn a_faulty_checkpoint_changes_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_sound_checkpoint_is_served_from_bytes_and_files() {
+async fn a_valid_checkpoint_is_served_from_bytes_and_files() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     for (seed, client) in (10..).zip(fixture.clients()) {
         for (model, seed) in [("cpn", seed), (client.transport().to_lowercase().as_str(), seed + 10)] {
@@ -75,7 +75,7 @@ async fn a_sound_checkpoint_is_served_from_bytes_and_files() {
     }
 }
 
-/// As many names as there is room for are served; one that is unloaded makes room for another.
+/// The number of names is bounded; unloading one makes room for another.
 #[tokio::test(flavor = "multi_thread")]
 async fn names_are_bounded_and_can_be_freed() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |config| config.model_capacity = 3.try_into().unwrap()).await;
@@ -115,7 +115,7 @@ async fn a_folder_with_too_many_models_is_refused() {
     assert_eq!(error.to_string(), "model_capacity: expected room for the 3 models that are there, got 2");
 }
 
-/// A file that lies elsewhere is not opened, though a link leads to it, and nothing of it is told.
+/// A link to a file outside the folder is not followed, and the error reveals nothing of the file.
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_outside_the_folder_is_opened() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
@@ -138,10 +138,10 @@ async fn nothing_outside_the_folder_is_opened() {
     }
 }
 
-/// Two checkpoints change places fifty times while every transport plans: no plan fails, and each is, to the bit, that
-/// of the checkpoint it names.
+/// Fifty swaps between two checkpoints while every transport plans: no plan fails, and each is, to the bit, that of the
+/// checkpoint it names.
 #[tokio::test(flavor = "multi_thread")]
-async fn plans_and_swaps_do_not_mix() {
+async fn plans_during_swaps_are_of_one_checkpoint_each() {
     let checkpoints = [cpn(1), cpn(2)];
     let fixture = Fixture::start(&[("cpn", checkpoints[0].clone())], |_| ()).await;
     let [swapper, ..] = fixture.clients();
@@ -178,9 +178,9 @@ async fn plans_and_swaps_do_not_mix() {
     }
 }
 
-/// Who names the checkpoint that must answer gets its plans after it was swapped out, for as long as it is kept.
+/// A request with the digest of a retired checkpoint is answered by it, for as long as it is kept.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_episode_ends_with_the_checkpoint_it_began_with() {
+async fn retired_checkpoints_answer_requests_with_their_digests() {
     let fixture = Fixture::start(&[("cpn", cpn(0))], |config| config.retired_capacity = 2.try_into().unwrap()).await;
     let pinned = |digest: &str| PlanRequest { model_digest: digest.into(), ..plan_request("cpn", 5) };
     let digests = [0, 1, 2, 3, 4].map(|seed| cpn::checkpoint::digest(&cpn(seed)));
@@ -195,7 +195,7 @@ async fn an_episode_ends_with_the_checkpoint_it_began_with() {
             assert_eq!(client.digest("cpn").await, digests[swap as usize]);
         }
     }
-    // Nobody asked for this one, so that it went first.
+    // Never requested, hence evicted first.
     is(Code::FailedPrecondition, "model_digest", swapper.plan(pinned(&digests[1])).await);
     swapper.load_model(from_bytes("cpn", cpn(4))).await.unwrap();
     swapper.load_model(from_bytes("cpn", cpn(2))).await.unwrap();
@@ -209,7 +209,7 @@ async fn an_episode_ends_with_the_checkpoint_it_began_with() {
     }
 }
 
-/// Serves bytes by the digest they are asked for with, be it theirs or not.
+/// Serves bytes at digests, which need not be their own.
 async fn publish<const N: usize>(session: &Session, bytes: [(&str, &[u8]); N]) -> Queryable<()> {
     let runtime = tokio::runtime::Handle::current();
     let bytes: HashMap<_, _> = bytes.into_iter().map(|(digest, bytes)| (digest.to_owned(), bytes.to_vec())).collect();
@@ -233,7 +233,7 @@ async fn publish<const N: usize>(session: &Session, bytes: [(&str, &[u8]); N]) -
         .unwrap()
 }
 
-/// What is to be said of a checkpoint.
+/// Manifest of a checkpoint.
 fn manifest(model: &str, version: u32, bytes: &[u8]) -> CheckpointManifest {
     let loaded = cpn::checkpoint::from_bytes(bytes).unwrap();
     CheckpointManifest {
@@ -252,7 +252,7 @@ async fn announce(session: &Session, manifest: CheckpointManifest, promoted_unix
     session.put(key, wire::encode(CheckpointAnnouncement { manifest, promoted_unix_nanos })).await.unwrap();
 }
 
-/// Waits until the planner serves what a manifest says.
+/// Waits until the planner serves the checkpoint of a manifest.
 async fn served(client: &Client, CheckpointManifest { model, version, digest, .. }: &CheckpointManifest) {
     let poll = async {
         loop {
@@ -266,8 +266,8 @@ async fn served(client: &Client, CheckpointManifest { model, version, digest, ..
     soon(poll).await;
 }
 
-/// Waits until the planner has dealt with everything that was announced before.
-async fn all_is_heeded(fixture: &Fixture, client: &Client, bytes: &[u8]) {
+/// Waits until the planner has processed all earlier announcements.
+async fn all_announcements_processed(fixture: &Fixture, client: &Client, bytes: &[u8]) {
     static MARKERS: AtomicU32 = AtomicU32::new(1);
     let marker = manifest("marker", MARKERS.fetch_add(1, Ordering::Relaxed), bytes);
     announce(&fixture.session, marker.clone(), marker.version.into()).await;
@@ -278,7 +278,7 @@ async fn all_is_heeded(fixture: &Fixture, client: &Client, bytes: &[u8]) {
 async fn an_announced_checkpoint_is_fetched() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let [client, ..] = fixture.clients();
-    // Larger than one piece.
+    // Larger than one chunk.
     let large = cpn::Model::new(cpn::ModelConfig::paper(MethodKind::TeBc), 4);
     let provenance = cpn::checkpoint::Provenance {
         training_tasks: vec![],
@@ -297,7 +297,7 @@ async fn an_announced_checkpoint_is_fetched() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_checkpoint_that_is_not_what_was_announced_is_refused() {
+async fn a_checkpoint_that_differs_from_its_announcement_is_refused() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let [client, ..] = fixture.clients();
     let before = client.list_models().await.unwrap();
@@ -317,18 +317,18 @@ async fn a_checkpoint_that_is_not_what_was_announced_is_refused() {
     }
     let noise = vec![0xff; 7];
     fixture.session.put(key::checkpoint_announcement("cpn").unwrap(), noise).await.unwrap();
-    all_is_heeded(&fixture, &client, &bytes).await;
+    all_announcements_processed(&fixture, &client, &bytes).await;
     let mut after = client.list_models().await.unwrap();
     after.models.retain(|info| info.name != "marker");
     assert_eq!(after, before);
-    // What was refused keeps nothing away, though it was promoted later.
+    // A refused announcement does not suppress an earlier promotion.
     announce(&fixture.session, good.clone(), 1).await;
     served(&client, &good).await;
 }
 
-/// What a trainer serves is wrong in spite of a right manifest.
+/// Bytes that do not match a valid manifest are refused.
 #[tokio::test(flavor = "multi_thread")]
-async fn corrupt_and_truncated_pieces_are_refused() {
+async fn corrupt_and_truncated_chunks_are_refused() {
     let bytes = cpn(2);
     let mut corrupt = bytes.clone();
     corrupt[bytes.len() / 2] ^= 1;
@@ -354,32 +354,32 @@ async fn corrupt_and_truncated_pieces_are_refused() {
         let served = [(&*manifest.digest, &*served), (&cpn::checkpoint::digest(&marker), &marker)];
         let _publisher = publish(&fixture.session, served).await;
         announce(&fixture.session, manifest, 1).await;
-        all_is_heeded(&fixture, &client, &marker).await;
+        all_announcements_processed(&fixture, &client, &marker).await;
         assert_eq!(client.digest("cpn").await, before);
     }
 }
 
-/// A roll-back announces an older version, a trainer repeats what it said, and messages come late: what was promoted last
-/// is served, in whatever order it is heard.
+/// The version promoted last is served, in whatever order announcements arrive: roll-backs announce older versions, and
+/// announcements are repeated and delayed.
 #[tokio::test(flavor = "multi_thread")]
-async fn what_was_promoted_last_is_served() {
+async fn the_version_promoted_last_is_served() {
     let fixture = Fixture::start(&[("cpn", cpn(1))], |_| ()).await;
     let [client, ..] = fixture.clients();
     let bytes = cpn(2);
     let _publisher = publish(&fixture.session, [(&cpn::checkpoint::digest(&bytes), &bytes)]).await;
     let version = |number| manifest("cpn", number, &bytes);
-    // Each is announced with when it was promoted; expected is what is served then.
+    // Announcements with promotion times, and the version served after each.
     for (number, promoted, expected) in
         [(1, 10, 1), (2, 20, 2), (1, 10, 2), (1, 30, 1), (2, 20, 1), (1, 30, 1), (3, 29, 1)]
     {
         announce(&fixture.session, version(number), promoted).await;
-        all_is_heeded(&fixture, &client, &bytes).await;
+        all_announcements_processed(&fixture, &client, &bytes).await;
         served(&client, &version(expected)).await;
     }
-    // A model that somebody loads stays until another is promoted.
+    // A model loaded by request stays until another is promoted.
     client.load_model(from_bytes("cpn", cpn(3))).await.unwrap();
     announce(&fixture.session, version(1), 30).await;
-    all_is_heeded(&fixture, &client, &bytes).await;
+    all_announcements_processed(&fixture, &client, &bytes).await;
     assert_eq!(client.digest("cpn").await, cpn::checkpoint::digest(&cpn(3)));
     announce(&fixture.session, version(1), 31).await;
     served(&client, &version(1)).await;

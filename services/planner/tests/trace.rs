@@ -1,4 +1,4 @@
-//! A request's spans, as a collector gets them.
+//! Spans of a request, as exported to a collector.
 
 #![expect(clippy::unwrap_used, reason = "tests")]
 
@@ -71,13 +71,13 @@ async fn spans_follow_a_request_from_its_client() {
     PlannerServiceClient::connect(format!("http://{grpc}")).await.unwrap().plan(request).await.unwrap();
     assert_traced(&mut spans).await;
 
-    // What is no traceparent does no harm.
+    // A malformed traceparent is ignored.
     let payload = plan_request(RANDOM, 1).encode_to_vec();
     let asked = session.get(key::planner_plan("traced").unwrap()).payload(payload).attachment("00-?");
     asked.await.unwrap().recv_async().await.unwrap().into_result().unwrap();
 }
 
-/// Waits for a request's span and those of its stages: one below the other, and all below the client's.
+/// Waits for the spans of a request and its stages, each the child of the next, and all descendants of the client's.
 async fn assert_traced(spans: &mut mpsc::UnboundedReceiver<Span>) {
     let mut found: Vec<Span> = Vec::new();
     while found.len() < 4 {

@@ -1,8 +1,8 @@
-//! Takes in demonstration streams, trains the learned methods, publishes checkpoints.
+//! Trainer: records demonstration streams, trains the learned methods, publishes checkpoints.
 //!
-//! Processes that meet in the file system, so that none can take another down: the service ([`service`]) keeps every
-//! committed episode ([`record`]), offers the versions of every model to the planners ([`publish`]), and starts and watches
-//! training runs ([`runs`]); a run ([`training`]) reads the episodes and writes a checkpoint.
+//! Service and training runs are separate processes that share only files, so that none can take another down. The service
+//! ([`service`]) stores committed episodes ([`record`]), publishes model versions to planners ([`publish`]), and starts and
+//! watches training runs ([`runs`]); a run ([`training`]) reads the episodes and writes a checkpoint.
 
 pub mod publish;
 mod queries;

@@ -1,5 +1,5 @@
-//! `cpn-trainer`: the service that takes in demonstrations, publishes checkpoints and starts training runs; the training
-//! run; and what is asked of the service or done with recordings.
+//! `cpn-trainer`: the service that records demonstrations, publishes checkpoints and starts training runs; the training run
+//! itself; and commands for the service and for recordings.
 
 mod cli;
 
@@ -72,10 +72,11 @@ async fn serve(config: service::Config) -> anyhow::Result<()> {
     service.shutdown().await
 }
 
-/// Follows the network until so many demonstrations are kept; answers whether they are, or it was told to stop before.
+/// Mirrors demonstrations from the network until `count` are stored; false if a signal stopped it before.
 async fn gather(config: &Config, count: usize, network: &SessionConfig) -> anyhow::Result<bool> {
     let recordings = Arc::new(Recordings::open(config.dataset.clone())?);
     let session = session::open(network).await?;
+
     let enough = tokio::select! {
         done = mirror::follow(&session, &recordings, count) => done.map(|()| true).map_err(|e| anyhow!(e))?,
         signal = shutdown::requested() => signal.map(|()| false)?,
@@ -160,7 +161,7 @@ async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: Runs
     session.close().await.map_err(|e| anyhow!(e))
 }
 
-/// Says how a run is; that it failed is an error.
+/// Prints the state of a run; a failed run is an error.
 async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
     session.close().await.map_err(|e| anyhow!(e))?;
     if let RunState::Failed { reason } = &run.state {

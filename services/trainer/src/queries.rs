@@ -1,4 +1,4 @@
-//! Queryables whose answers may take their time.
+//! Queryables with blocking handlers.
 
 use std::sync::Arc;
 use tokio::runtime::Handle;
@@ -9,11 +9,11 @@ use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::query::{Query, Queryable};
 
-/// Queries of one kind that are answered or wait for it at the same time; each holds an episode at most.
+/// Maximum number of concurrent queries per queryable; each holds at most one episode in memory.
 const PLACES: usize = 16;
 
-/// Answers queries on threads that may read and write files; zenoh's callback only starts them. A `complete` queryable
-/// answers for all others of its keys.
+/// Declares a queryable whose handler runs on blocking threads; zenoh's callback only starts them. A query to a `complete`
+/// queryable goes to no other of its keys.
 pub(crate) async fn serve(
     session: &Session,
     key: OwnedKeyExpr,

@@ -1,4 +1,4 @@
-//! The trainer's network face: demonstrations in, checkpoints out, training runs started, watched and stopped.
+//! Trainer service: records demonstrations, publishes checkpoints, and starts, watches and stops training runs.
 
 use crate::publish::versions::Versions;
 use crate::publish::{self, Publisher};
@@ -22,17 +22,17 @@ use tracing::info;
 use wire::{access, key};
 use zenoh::liveliness::LivelinessToken;
 
-/// How long requests in flight may take to finish at shutdown, after training runs have saved their states: with the rest of it,
-/// less than ten seconds.
+/// Timeout of requests in flight at shutdown, after training runs have saved their states; the rest of it then takes less than
+/// ten seconds.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(7);
 
-/// What can be changed of a trainer.
+/// State-changing requests of a trainer.
 pub(crate) const CHANGES: Changes = Changes {
     metric: "cpn_trainer_changes_refused_total",
     methods: &[("/cpn.v1.TrainerService/StartRun", "start_run"), ("/cpn.v1.TrainerService/StopRun", "stop_run")],
 };
 
-/// Settings of the service: options of its command line, keys of its file.
+/// Settings of the service: options of its command line, and keys of its configuration file.
 #[derive(Debug, Clone, Serialize, Deserialize, clap::Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -82,7 +82,7 @@ fn this_program() -> PathBuf {
     std::env::current_exe().unwrap_or_else(|_| "cpn-trainer".into())
 }
 
-/// A running service.
+/// Running service.
 #[derive(Debug)]
 pub struct Service {
     session: zenoh::Session,
@@ -95,15 +95,15 @@ pub struct Service {
     alive: LivelinessToken,
 }
 
-/// Starts the service; when this returns, it answers.
+/// Starts the service; when this returns, all transports answer.
 ///
 /// # Errors
-/// If the dataset is mixed or cannot be read, the published versions cannot be read, an address cannot be listened on, the
-/// session cannot be opened, or the name cannot stand in a key or is that of a running service.
+/// If the dataset cannot be read or has several render specs, the published versions cannot be read, an address cannot be
+/// listened on, the session cannot be opened, or the name is not valid in a key or is that of a running service.
 pub async fn start(config: Config) -> anyhow::Result<Service> {
     let Config { name, dataset, checkpoints, keep_versions, runs, max_runs, program, .. } = config.clone();
     let network = &config.session;
-    // All settings are checked before the first is acted upon.
+    // Checked before anything starts.
     let token = key::trainer_alive(&name)?;
     let access = Access::new(network.tls()?.is_some(), config.tokens.as_deref())?;
     let listen = network.listen_at(config.grpc_listen, service_kit::grpc::MAX_CONNECTIONS)?;
@@ -111,6 +111,7 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
         let listen = network.listen_at(address, metrics::MAX_CONNECTIONS)?;
         metrics::serve(listen, access.clone(), access::may_scrape).await?;
     }
+
     let of_runs = runs::Config {
         folder: runs,
         dataset: dataset.clone(),
@@ -123,12 +124,14 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
         anyhow::Ok((Arc::new(Recordings::open(dataset)?), Arc::new(versions), Runs::open(of_runs)?))
     };
     let (recordings, versions, runs) = tokio::task::spawn_blocking(open).await??;
-    // Before the network is waited for, so that health tells of it.
+
+    // Before the session, so that health reports a missing connection.
     let mut grpc = runs::grpc::start(runs.clone(), listen, access).await?;
     let session = session::open(network).await?;
     session::claim(&session, network, &token).await?;
     let connection = Connection::follow(&session, network);
     grpc.follow(connection.connected());
+
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
     let recorder = record::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
     let runs_zenoh = runs::zenoh::start(&session, &name, &runs).await?;
@@ -138,6 +141,7 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
         runs::metrics::follow(measured).await;
         Ok(())
     });
+
     let alive = session.liveliness().declare_token(token).await.map_err(|e| anyhow!(e))?;
     grpc.ready().await;
     info!(name, grpc = %grpc.address, "trainer is ready");
@@ -145,20 +149,20 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
 }
 
 impl Service {
-    /// The training runs, without a transport.
+    /// Registry of training runs, without transports.
     pub fn runs(&self) -> Runs {
         self.runs.clone()
     }
 
-    /// Where gRPC listens.
+    /// Listening address of gRPC.
     pub fn grpc_address(&self) -> SocketAddr {
         self.grpc.address
     }
 
-    /// Runs until a part of the service fails.
+    /// Waits until a task of the service fails.
     ///
     /// # Errors
-    /// Why it failed.
+    /// The error of the failed task.
     pub async fn failed(&mut self) -> anyhow::Result<()> {
         match self.publisher.tasks.join_next().await {
             Some(result) => result?,
@@ -166,15 +170,14 @@ impl Service {
         }
     }
 
-    /// Interrupts the training runs, which save their states, and leaves the network. Every episode that was acknowledged
-    /// is on disk already.
+    /// Interrupts the training runs, which save their states, and closes the session. Acknowledged episodes are on disk already.
     ///
     /// # Errors
-    /// If gRPC had failed before, or the session does not close.
+    /// If gRPC had failed before, or the session cannot be closed.
     pub async fn shutdown(mut self) -> anyhow::Result<()> {
         drop((self.connection, self.alive, self.recorder));
         self.runs.shutdown().await;
-        // Who watches a run has seen its end; a client that keeps asking does not keep the service.
+        // Watchers of a run have seen its end; clients with long requests are cut off.
         let drained = tokio::time::timeout(DRAIN_TIMEOUT, self.grpc.drain()).await;
         drop(self.runs_zenoh);
         self.publisher.tasks.shutdown().await;

@@ -1,4 +1,4 @@
-//! Refused changes of state leave a trace: a line in the log and a count.
+//! Refused state changes are logged and counted.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -17,7 +17,7 @@ use wire::{key, proto, query};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Ends the trainer when it is dropped.
+/// Process of a trainer, killed when dropped.
 struct Process(Child);
 
 impl Drop for Process {

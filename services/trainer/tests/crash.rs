@@ -1,4 +1,4 @@
-//! A recorder that is killed again and again, at any moment, loses nothing that it acknowledged.
+//! A recorder that is killed repeatedly, at random moments, loses no acknowledged episode.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -20,7 +20,7 @@ use wire::key;
 use zenoh::Session;
 use zenoh::sample::SampleKind;
 
-/// Senders at the same time.
+/// Number of concurrent senders.
 const SENDERS: u64 = 3;
 const STEPS: u32 = 4;
 
@@ -35,7 +35,7 @@ async fn a_recorder_that_is_killed_a_hundred_times_loses_nothing() {
     survives(100, "tcp/127.0.0.1:17492").await;
 }
 
-/// The real service. It connects to the sender, so that it is back as soon as it is up.
+/// The real service, which connects to the sender, so that it is reachable as soon as it is up.
 fn start(folder: &Path, endpoint: &str) -> Child {
     Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
         .args(["serve", "--connect", endpoint, "--dataset"])
@@ -51,7 +51,7 @@ fn start(folder: &Path, endpoint: &str) -> Child {
         .unwrap()
 }
 
-/// Sends one episode after the other, until told to stop; answers all that were sent.
+/// Sends episodes until stopped, and returns them.
 async fn stream(session: Session, first: u64, kept: Arc<Mutex<BTreeSet<u64>>>, stop: Arc<Mutex<bool>>) -> Vec<Episode> {
     let mut sent = Vec::new();
     for seed in (first..).step_by(SENDERS as usize) {
@@ -80,7 +80,7 @@ async fn survives(kills: u32, endpoint: &str) {
     let heard = session.declare_subscriber(key::demonstration_recorded("*").unwrap()).await.unwrap();
     for _ in 0..kills {
         let mut recorder = start(folder.path(), endpoint);
-        // Once it works it may die at any moment; what it was doing then is left to chance.
+        // Killed at a random moment after it works.
         let sample =
             tokio::time::timeout(Duration::from_secs(60), heard.recv_async()).await.expect("a recorder").unwrap();
         assert_eq!(sample.kind(), SampleKind::Put);

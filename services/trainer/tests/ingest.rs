@@ -1,4 +1,4 @@
-//! Demonstration streams over real zenoh sessions: nothing is lost, nothing is kept twice, nothing wrong is kept.
+//! Demonstration streams over real zenoh sessions: no episode is lost, stored twice, or stored invalid.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -20,7 +20,7 @@ async fn send(session: &Session, step: DemonstrationStep) {
     session.put(key, encode(step)).congestion_control(zenoh::qos::CongestionControl::Block).await.unwrap();
 }
 
-/// Commits as a worker does: again as long as nobody answers.
+/// Commits as a worker does, with retries while nobody answers.
 async fn send_commit(session: &Session, request: &CommitEpisodeRequest) -> Result<Vec<u32>, Error> {
     let key = key::demonstration_commit(&request.episode.episode_id).unwrap();
     loop {
@@ -33,7 +33,7 @@ async fn send_commit(session: &Session, request: &CommitEpisodeRequest) -> Resul
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stream_with_losses_is_kept_whole_in_the_end() {
+async fn a_lossy_stream_is_stored_completely_in_the_end() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = sessions("tcp/127.0.0.1:17451").await;
     let _recorder = record(&trainer, folder.path(), Limits::default()).await;
@@ -58,7 +58,7 @@ async fn a_stream_with_losses_is_kept_whole_in_the_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
+async fn an_invalid_episode_is_refused_and_the_next_one_stored() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = sessions("tcp/127.0.0.1:17452").await;
     let _recorder = record(&trainer, folder.path(), Limits::default()).await;
@@ -79,7 +79,7 @@ async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
             for step in &steps {
                 send(&worker, step.clone()).await;
             }
-            // Steps sent before the worker knew of the recorder are missing: they are sent again.
+            // Steps sent before the worker discovered the recorder are missing, and sent again.
             if let Err(error) = send_commit(&worker, &commit(&good)).await {
                 break error;
             }
@@ -100,9 +100,9 @@ async fn what_is_no_episode_is_refused_and_the_next_one_kept() {
     assert_eq!(files(folder.path()).len(), 1);
 }
 
-/// One place, six senders at once: five wait at any time, and their steps are dropped.
+/// One place and six concurrent senders: five wait at any time, and their steps are dropped.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recorder_that_cannot_keep_up_loses_nothing_for_good() {
+async fn an_overloaded_recorder_stores_everything_in_the_end() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = sessions("tcp/127.0.0.1:17453").await;
     let limits = Limits { episodes: 1, silence: Duration::MAX };
@@ -122,7 +122,7 @@ async fn a_recorder_that_cannot_keep_up_loses_nothing_for_good() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_episode_that_fell_silent_makes_room() {
+async fn a_silent_episode_frees_its_place() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = sessions("tcp/127.0.0.1:17454").await;
     let (_recorder, _) = record(&trainer, folder.path(), Limits { episodes: 1, silence: Duration::ZERO }).await;
@@ -130,9 +130,9 @@ async fn an_episode_that_fell_silent_makes_room() {
     send::send(&worker, &episode("reach", 2, 2)).await.unwrap();
 }
 
-/// What a subscriber missed, it can ask for: the same bytes at the same keys.
+/// Stored episodes can be queried at the keys they were streamed at, with the same bytes.
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_kept_is_announced_listed_and_sent_again() {
+async fn stored_episodes_are_announced_listed_and_served() {
     let folder = tempfile::tempdir().unwrap();
     let (trainer, worker) = sessions("tcp/127.0.0.1:17455").await;
     let announced = trainer.declare_subscriber(key::demonstration_recorded("*").unwrap()).await.unwrap();
@@ -150,9 +150,9 @@ async fn what_is_kept_is_announced_listed_and_sent_again() {
         assert_eq!(decode::<RecordedEpisode>(&sample.payload().to_bytes()).unwrap(), *episode.info());
     }
 
-    // A recorder that starts anew knows what was kept before.
+    // A restarted recorder has the stored episodes.
     drop(recorder);
-    // zenoh lets go of its callbacks, and they of the folder, in its own time.
+    // zenoh drops its callbacks, and with them the folder's lock, with a delay.
     while Recordings::open(folder.path().to_owned()).is_err() {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
@@ -186,7 +186,7 @@ async fn what_is_kept_is_announced_listed_and_sent_again() {
 }
 
 #[test]
-fn a_folder_is_taken_over_as_it_was_left() {
+fn a_folder_of_a_killed_process_is_cleaned_and_reopened() {
     let folder = tempfile::tempdir().unwrap();
     common::keep(folder.path(), &episode("reach", 1, 3));
     let task = folder.path().join("reach");

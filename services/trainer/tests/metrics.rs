@@ -1,4 +1,4 @@
-//! What Prometheus finds.
+//! Prometheus metrics of recordings and runs.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -13,7 +13,7 @@ use trainer::record::send;
 use trainer::service;
 use wire::training::StartRunRequest;
 
-/// The metrics, as Prometheus asks for them.
+/// Scrapes the metrics.
 async fn scrape(address: &str) -> String {
     let mut stream = TcpStream::connect(address).await.unwrap();
     let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
@@ -62,7 +62,7 @@ async fn recordings_and_runs_are_counted() {
         format!("cpn_training_samples_per_second{{run=\"short\"}} {}", last.samples_per_second),
         "cpn_training_running{run=\"short\"} 0".to_owned(),
     ];
-    // The metrics follow the run.
+    // Metrics are updated shortly after the run.
     let mut found = scrape(metrics).await;
     for _ in 0..100 {
         if found.contains(expected.last().unwrap()) {

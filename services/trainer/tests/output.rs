@@ -1,4 +1,4 @@
-//! What becomes of results that cannot be written.
+//! Commands whose standard output cannot be written.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -15,7 +15,7 @@ fn trainer(arguments: &[&str], folder: &TempDir) -> Command {
     command
 }
 
-/// How a command ends, and what it says on standard error, when nobody reads its standard output.
+/// Exit status and standard error of a command with a closed standard output.
 fn unread(mut command: Command) -> (ExitStatus, String) {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
@@ -23,7 +23,7 @@ fn unread(mut command: Command) -> (ExitStatus, String) {
     (output.status, String::from_utf8(output.stderr).unwrap())
 }
 
-/// The same on a full disk.
+/// Exit status and standard error of a command whose standard output is on a full disk.
 fn full(mut command: Command) -> (ExitStatus, String) {
     let output = command.stdout(File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
     (output.status, String::from_utf8(output.stderr).unwrap())
@@ -52,7 +52,7 @@ fn a_closed_output_ends_quietly_and_a_full_disk_is_named() {
     }
 }
 
-/// A log that cannot be written keeps nobody from work.
+/// A log that cannot be written does not stop a command.
 #[test]
 fn a_full_log_is_no_error() {
     let folder = TempDir::new().unwrap();

@@ -1,4 +1,4 @@
-//! A planner that is up, and one that comes later, serve what the trainer publishes, promotes and rolls back.
+//! Published, promoted and rolled-back versions reach a running planner, and one that starts later.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -17,7 +17,7 @@ use tokio::process::Command;
 use trainer::service::{self, Service};
 use wire::planner::ModelInfo;
 
-/// Writes a checkpoint as a training run does; answers its digest.
+/// Writes a checkpoint as a training run does; returns its digest.
 fn write(folder: &Path, seed: u64) -> String {
     let bytes = checkpoint(seed);
     files::write_atomically(&folder.join("checkpoints/cpn.safetensors"), &bytes).unwrap();
@@ -83,7 +83,7 @@ async fn checkpoints_reach_every_planner() {
     served(&early, 2, &second).await;
     served(&late, 2, &second).await;
 
-    // A trainer that comes back announces what was promoted last, not what was written last.
+    // A restarted trainer announces the version promoted last, not the one written last.
     let connecting = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
     let session = service_kit::session::open(&connecting).await.unwrap();
     assert_eq!(trainer::publish::roll_back(&session, "cpn".into()).await.unwrap().digest, first);
@@ -153,7 +153,7 @@ async fn versions_are_listed_promoted_and_rolled_back_from_the_command_line() {
     trainer.shutdown().await.unwrap();
 }
 
-/// Of two planners, the one that wants signatures serves a version once it is signed, without a further promotion.
+/// A planner that enforces signatures serves a version once it is signed, without a further promotion.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_signature_reaches_planners_after_its_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
@@ -179,7 +179,7 @@ async fn a_signature_reaches_planners_after_its_checkpoint() {
     let second = write(folder, 2);
     served(&lax, 2, &second).await;
     sign(2, 2);
-    // What is written next is announced after that.
+    // The next checkpoint is announced after that.
     files::write_atomically(&folder.join("checkpoints/other.safetensors"), &checkpoint(3)).unwrap();
     served(&lax, 1, &cpn::checkpoint::digest(&checkpoint(3))).await;
     let models = strict.core().list_models().models;

@@ -1,4 +1,4 @@
-//! What else is done with recordings: sent again, copied, checked.
+//! Recordings: sending, mirroring, verification.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -26,7 +26,7 @@ fn dataset(folder: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_replayed_dataset_is_the_same_to_the_byte() {
+async fn a_replayed_dataset_is_identical() {
     let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     dataset(from.path());
     let (trainer, sender) = sessions("tcp/127.0.0.1:17471").await;
@@ -42,7 +42,7 @@ async fn a_replayed_dataset_is_the_same_to_the_byte() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
+async fn a_mirror_fetches_earlier_and_later_episodes() {
     let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     dataset(from.path());
     keep(to.path(), &episode("reach", 2, 5));
@@ -69,9 +69,9 @@ async fn a_late_joiner_gets_what_it_missed_and_what_follows() {
     assert_eq!(files(to.path()), files(from.path()));
 }
 
-/// The real process, which is up before the last demonstrations are, and is stopped once before.
+/// The real training process, started before the last demonstrations exist, and interrupted once.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_follows_the_stream_until_it_has_enough() {
+async fn a_run_mirrors_demonstrations_until_it_has_enough() {
     let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     dataset(from.path());
     let endpoint = "tcp/127.0.0.1:17474";
@@ -107,7 +107,7 @@ async fn a_run_follows_the_stream_until_it_has_enough() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_mirror_keeps_no_other_episode_under_the_same_id() {
+async fn a_mirror_refuses_a_different_episode_of_the_same_id() {
     let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     dataset(from.path());
     keep(to.path(), &episode("reach", 2, 7));
@@ -121,7 +121,7 @@ async fn a_mirror_keeps_no_other_episode_under_the_same_id() {
 }
 
 #[test]
-fn verify_tells_what_is_in_a_dataset() {
+fn verify_reports_the_contents_of_a_dataset() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let report = verify::run(folder.path(), 1, 1).unwrap();
@@ -133,7 +133,7 @@ fn verify_tells_what_is_in_a_dataset() {
     assert!(text.contains("reach") && text.contains(&report.digest), "{text}");
 }
 
-/// The faults of a dataset into which one has been planted.
+/// Faults of a dataset with a planted one.
 fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>)) -> Vec<String> {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
@@ -148,7 +148,7 @@ fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>))
 }
 
 #[test]
-fn verify_finds_what_is_wrong_inside_an_episode() {
+fn verify_finds_faults_inside_an_episode() {
     let place = "reach/reach-3.mcap: ";
     assert_eq!(faults(|_, _| ()), Vec::<String>::new(), "nothing is wrong before it is planted");
     let found = faults(|_, steps| steps[2].frame = steps[1].frame.clone());
@@ -174,9 +174,9 @@ fn verify_finds_what_is_wrong_inside_an_episode() {
     assert_eq!(found, [r#"control_hz: expected one, got 2: {"40", "80"}"#]);
 }
 
-/// By its place a recording is held out of a training, and found again by its id.
+/// A recording's path decides whether it is held out of a training, so that a misplaced one is refused.
 #[test]
-fn a_recording_in_the_place_of_another_is_not_taken_for_it() {
+fn a_misplaced_recording_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let wrong = folder.path().join("push/reach-2.mcap");
@@ -191,9 +191,9 @@ fn a_recording_in_the_place_of_another_is_not_taken_for_it() {
     assert_eq!(recordings.read("reach-2").unwrap(), Some(episode("reach", 2, 5)));
 }
 
-/// "Kept" is said of what is on disk and whole, also while the recorder is up.
+/// Only intact files on disk count as stored, also while the recorder runs.
 #[test]
-fn a_recording_that_was_cut_or_removed_is_recorded_again() {
+fn a_truncated_or_removed_recording_is_recorded_again() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let (path, whole) = (folder.path().join("reach/reach-2.mcap"), episode("reach", 2, 5));
@@ -224,9 +224,9 @@ fn a_recording_that_was_cut_or_removed_is_recorded_again() {
     }
 }
 
-/// What others put into the folder is not written over, and what they took away no longer decides how frames are rendered.
+/// Files that others put into the folder are not overwritten, and removed ones no longer determine the render spec.
 #[test]
-fn a_recorder_sees_what_others_do_in_its_folder() {
+fn a_recorder_notices_changes_by_others_in_its_folder() {
     let folder = tempfile::tempdir().unwrap();
     let recordings = Recordings::open(folder.path().to_owned()).unwrap();
     recordings.keep(&episode("reach", 0, 3)).unwrap();
@@ -246,9 +246,9 @@ fn a_recorder_sees_what_others_do_in_its_folder() {
     assert_eq!(recordings.all(), [other.info().clone()]);
 }
 
-/// By its id a recording is told from others, by every reader.
+/// Every reader refuses two recordings of one id.
 #[test]
-fn two_recordings_of_one_id_are_found() {
+fn two_recordings_of_one_id_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let mut info = info("push", 2, &episode("reach", 2, 5).into_steps());
@@ -264,9 +264,9 @@ fn two_recordings_of_one_id_are_found() {
     assert_eq!(Recordings::open(folder.path().to_owned()).unwrap().count(), 3);
 }
 
-/// Other programs leave files where recordings are kept.
+/// Hidden files of other programs in the folder are ignored.
 #[test]
-fn files_that_come_along_are_nobodys() {
+fn hidden_files_are_ignored() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let before = (verify::run(folder.path(), 1, 1).unwrap().digest, files(folder.path()));
@@ -284,7 +284,7 @@ fn files_that_come_along_are_nobodys() {
 }
 
 #[test]
-fn a_folder_has_one_keeper_and_an_id_one_episode() {
+fn a_folder_has_one_recorder_and_an_id_one_episode() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let recordings = Recordings::open(folder.path().to_owned()).unwrap();
@@ -309,7 +309,7 @@ fn a_folder_has_one_keeper_and_an_id_one_episode() {
 }
 
 #[test]
-fn verify_finds_what_is_wrong_with_the_whole() {
+fn verify_finds_faults_of_the_dataset() {
     let folder = tempfile::tempdir().unwrap();
     dataset(folder.path());
     let path = folder.path().join("push/push-0.mcap");

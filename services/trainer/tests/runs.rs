@@ -1,4 +1,4 @@
-//! Training runs of a real service, by each of its transports: one contract.
+//! Contract of training runs of a real service, over each transport.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -26,22 +26,22 @@ use wire::{Code, Error, Message, key, proto, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
-/// What no test should ever reach.
+/// Timeout that no passing test reaches.
 const PATIENCE: Duration = Duration::from_secs(120);
 const NAME: &str = "under-test";
-/// Settings of a run that is soon over.
+/// Settings of a short run.
 const SHORT: &str = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 2\n";
-/// Settings of a run that is not over before it is stopped.
+/// Settings of a run too long to finish before it is stopped.
 const LONG: &str = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 100000\n";
 
-/// A running service, with a second zenoh session and a gRPC channel to it.
+/// Running service, with a second zenoh session and a gRPC channel to it.
 struct Fixture {
     service: Service,
     session: Session,
     channel: Channel,
 }
 
-/// A folder with demonstrations.
+/// Folder with demonstrations.
 fn folder() -> TempDir {
     let folder = TempDir::new().unwrap();
     for (task, seed, steps) in [("reach", 1, 9), ("reach", 2, 7), ("door-lock", 1, 8)] {
@@ -79,7 +79,7 @@ impl Fixture {
             session,
             service,
         };
-        // The declarations take a moment to arrive.
+        // Declarations arrive with a delay.
         trainer::runs::client::list(&fixture.session, NAME).await.unwrap();
         fixture
     }
@@ -93,7 +93,7 @@ impl Fixture {
     }
 }
 
-/// One way to reach a trainer. Requests are protobuf, so that wrong ones can be sent.
+/// Client of one transport. Requests are protobuf messages, so that invalid ones can be sent.
 #[derive(Clone)]
 enum Client {
     InProcess(Runs),
@@ -149,7 +149,7 @@ impl Client {
         }
     }
 
-    /// How a run is from now on.
+    /// Stream of a run's states.
     async fn watch(&self, name: &str) -> Result<Pin<Box<dyn Stream<Item = Run> + Send>>, Error> {
         let request = proto::WatchRunRequest { name: name.into() };
         match self {
@@ -181,12 +181,12 @@ impl Client {
         }
     }
 
-    /// How a run is until it runs no more.
+    /// States of a run until it ends.
     async fn to_the_end(&self, name: &str) -> Vec<Run> {
         soon(self.watch(name).await.unwrap().collect()).await
     }
 
-    /// Waits until a run has done a step.
+    /// Waits for the first step of a run.
     async fn first_step(&self, name: &str) -> Run {
         let mut runs = self.watch(name).await.unwrap();
         loop {
@@ -199,7 +199,7 @@ impl Client {
     }
 }
 
-/// Sends any bytes as a query's payload.
+/// Sends a query with any bytes as its payload.
 async fn raw_query<R: Message>(session: &Session, key: &OwnedKeyExpr, payload: Vec<u8>) -> Result<R, Error> {
     let replies = session.get(key).timeout(PATIENCE).payload(payload).await.unwrap();
     match replies.recv_async().await.unwrap().into_result() {
@@ -211,7 +211,7 @@ async fn raw_query<R: Message>(session: &Session, key: &OwnedKeyExpr, payload: V
     }
 }
 
-/// Fails instead of waiting for ever.
+/// Awaits with a timeout, so that a test fails instead of hanging.
 async fn soon<F: Future>(future: F) -> F::Output {
     tokio::time::timeout(PATIENCE, future).await.expect("nothing happened for two minutes")
 }
@@ -227,7 +227,7 @@ fn request(name: &str, settings: &str) -> proto::StartRunRequest {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_transport_runs_and_watches() {
+async fn every_transport_starts_and_watches_runs() {
     let folder = folder();
     let fixture = Fixture::start(folder.path()).await;
     let mut digests = Vec::new();
@@ -240,7 +240,7 @@ async fn every_transport_runs_and_watches() {
         assert!(before.iter().all(|run| run.state == RunState::Running), "{name}: {before:?}");
         let steps: Vec<_> = heard.iter().filter_map(|run| Some(run.progress?.step)).collect();
         assert!(steps.is_sorted(), "{name}: {steps:?}");
-        // 14 samples in batches of 4, twice.
+        // Two epochs of 14 samples in batches of 4.
         let progress = last.progress.unwrap();
         assert_eq!((progress.step, progress.steps, progress.epoch, progress.samples), (8, 8, 2, 28), "{name}");
         let RunState::Finished { digest } = &last.state else { panic!("{name}: {last:?}") };
@@ -255,7 +255,7 @@ async fn every_transport_runs_and_watches() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_transport_stops_and_takes_up() {
+async fn every_transport_stops_and_resumes_runs() {
     let folder = folder();
     let fixture = Fixture::start(folder.path()).await;
     for client in fixture.clients() {
@@ -285,7 +285,7 @@ async fn every_transport_stops_and_takes_up() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_transport_refuses_the_same() {
+async fn every_transport_refuses_the_same_requests() {
     let folder = folder();
     let fixture = Fixture::start(folder.path()).await;
     let with = |settings: &str| request("wrong", settings);
@@ -322,7 +322,7 @@ async fn every_transport_refuses_the_same() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_that_fails_says_why() {
+async fn a_failed_run_has_its_reason() {
     let folder = folder();
     let fixture = Fixture::start(folder.path()).await;
     let [client, ..] = fixture.clients();
@@ -333,7 +333,7 @@ async fn a_run_that_fails_says_why() {
     fixture.service.shutdown().await.unwrap();
 }
 
-/// The state of a run outlasts the service, and so does its work.
+/// A run's state and progress outlast the service.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_outlasts_the_service() {
     let folder = folder();
@@ -358,7 +358,7 @@ async fn a_run_outlasts_the_service() {
     fixture.service.shutdown().await.unwrap();
 }
 
-/// What is said of runs is said of their folders, which belong to one service.
+/// The registry follows the folders of runs: a removed one can be started anew.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_whose_folder_was_removed_is_started_anew() {
     let folder = folder();
@@ -371,7 +371,7 @@ async fn a_run_whose_folder_was_removed_is_started_anew() {
         std::fs::remove_dir_all(folder.path().join("runs/run")).unwrap();
         assert_eq!(client.list().await.unwrap(), [], "{}", client.transport());
     }
-    // What others leave there is no run, damaged or not.
+    // Files of others in the folder are not runs, damaged or not.
     std::fs::create_dir(folder.path().join("runs/.Trash-1000")).unwrap();
     let config = trainer::runs::Config {
         folder: folder.path().join("runs"),

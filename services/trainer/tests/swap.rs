@@ -1,5 +1,5 @@
-//! Versions are promoted, announced, fetched, tried and swapped in one after the other while clients plan: no plan fails,
-//! and each is, to the bit, that of the checkpoint it names.
+//! Versions are promoted, announced, fetched and swapped in one after the other while clients plan: no plan fails, and each is,
+//! to the bit, that of the checkpoint it names.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -19,25 +19,25 @@ use zenoh::Session;
 
 const MODEL: &str = "cpn";
 const PLANNER: &str = "planner";
-/// Plans of an episode.
+/// Number of plans of an episode.
 const EPISODE: usize = 8;
-/// How long a client waits between two plans.
+/// Pause of a client between two plans.
 const PAUSE: Duration = Duration::from_millis(5);
-/// What no step here ever takes.
+/// Timeout that no passing test reaches.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[tokio::test(flavor = "multi_thread")]
-async fn swaps_and_plans_do_not_mix() {
+async fn plans_during_swaps_are_of_one_checkpoint_each() {
     swap(50, "tcp/127.0.0.1:17481").await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "long; `make test-swap`"]
-async fn a_thousand_swaps_and_plans_do_not_mix() {
+async fn plans_during_a_thousand_swaps_are_of_one_checkpoint_each() {
     swap(1000, "tcp/127.0.0.1:17482").await;
 }
 
-/// The actions that each checkpoint plans, by its digest.
+/// Planned actions of each checkpoint, by its digest.
 type Expected = HashMap<String, Vec<Vec<f32>>>;
 
 async fn swap(swaps: u32, endpoint: &str) {
@@ -117,7 +117,7 @@ async fn swap(swaps: u32, endpoint: &str) {
     trainer.shutdown().await.unwrap();
 }
 
-/// A session that knows the planner.
+/// Session that has discovered the planner.
 async fn joined(config: &SessionConfig) -> Session {
     let session = service_kit::session::open(config).await.unwrap();
     let token = key::planner_alive(PLANNER).unwrap();
@@ -129,7 +129,7 @@ async fn joined(config: &SessionConfig) -> Session {
 #[derive(Debug, Default)]
 struct Answers {
     plans: usize,
-    /// Those of clients that did not ask for one checkpoint, and got several.
+    /// Episodes of clients that did not pin a checkpoint, and got several.
     mixed_episodes: usize,
 }
 
@@ -140,7 +140,7 @@ impl Answers {
     }
 }
 
-/// The digests that answered the plans of an episode, each of which is that of its checkpoint; all the same if `pinned`.
+/// Digests of the checkpoints that answered an episode, whose plans are checked to be theirs; all the same if `pinned`.
 async fn episode(session: &Session, expected: &Expected, pinned: bool) -> Vec<String> {
     let mut digests: Vec<String> = Vec::new();
     for _ in 0..EPISODE {

@@ -1,4 +1,4 @@
-//! What is kept of a model's versions, through restarts and damage.
+//! Versions of a model, through restarts and damage.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -24,7 +24,7 @@ fn open(folder: &TempDir, keep: u16) -> Versions {
     Versions::open(folder.path().to_owned(), NonZeroU16::new(keep).unwrap()).unwrap()
 }
 
-/// The version numbers of the model "cpn", and which is promoted.
+/// Version numbers of the model "cpn", and the promoted one.
 fn listed(versions: &Versions) -> (Vec<u32>, u32) {
     let listed = versions.list(ListVersionsRequest { model: Some("cpn".into()) }).unwrap().versions;
     let promoted: Vec<_> = listed.iter().filter(|version| version.promoted).collect();
@@ -44,7 +44,7 @@ fn announced(versions: &Versions) -> CheckpointAnnouncement {
     versions.promoted().borrow()["cpn"].clone()
 }
 
-/// All bytes of a version, in pieces.
+/// Bytes of a version, fetched in chunks.
 fn fetched(versions: &Versions, manifest: &CheckpointManifest) -> Vec<u8> {
     let mut bytes = Vec::new();
     while (bytes.len() as u64) < manifest.size_bytes {
@@ -55,7 +55,7 @@ fn fetched(versions: &Versions, manifest: &CheckpointManifest) -> Vec<u8> {
     bytes
 }
 
-/// The names of the files of the model "cpn".
+/// Names of the files of the model "cpn".
 fn files(folder: &TempDir) -> BTreeSet<String> {
     let entries = std::fs::read_dir(folder.path().join("versions/cpn")).unwrap();
     entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
@@ -74,7 +74,7 @@ fn a_checkpoint_becomes_the_next_version_and_is_promoted() {
     for (number, seed) in [(1, 1), (2, 2), (3, 1)] {
         let bytes = checkpoint(seed);
         versions.publish("cpn", &bytes).unwrap();
-        // The same once more is nothing new.
+        // The same checkpoint again is no new version.
         versions.publish("cpn", &bytes).unwrap();
         let loaded = cpn::checkpoint::from_bytes(&bytes).unwrap();
         let manifest = CheckpointManifest {
@@ -97,7 +97,7 @@ fn a_checkpoint_becomes_the_next_version_and_is_promoted() {
 }
 
 #[test]
-fn promotions_go_forth_and_back() {
+fn versions_are_promoted_and_rolled_back() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     for seed in 1..=3 {
@@ -122,7 +122,7 @@ fn promotions_go_forth_and_back() {
 }
 
 #[test]
-fn what_is_unknown_is_named() {
+fn unknown_models_and_versions_are_named() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     versions.publish("cpn", &checkpoint(1)).unwrap();
@@ -167,7 +167,7 @@ fn the_last_versions_are_kept() {
     assert_eq!(files(&folder), weights(&[3, 4]));
     promote(&versions, 3).unwrap();
     drop(versions);
-    // Fewer are to be kept than there are; the promoted one always is.
+    // With a lower limit than there are versions, the promoted one is still kept.
     let versions = open(&folder, 1);
     assert_eq!(listed(&versions), (vec![3, 4], 3));
     versions.publish("cpn", &checkpoint(5)).unwrap();
@@ -203,7 +203,7 @@ fn a_restart_changes_nothing() {
     assert!(format!("{error:#}").contains("expected one that no process keeps"), "{error:#}");
     drop(versions);
 
-    // What a process leaves that was killed before the history knew of it.
+    // Files of a process that was killed before it wrote the history.
     let kept = folder.path().join("versions/cpn");
     for name in [".unfinished-1", &format!("{}.safetensors", "0".repeat(64))] {
         std::fs::write(kept.join(name), b"half").unwrap();
@@ -212,7 +212,7 @@ fn a_restart_changes_nothing() {
     let versions = open(&folder, 5);
     assert_eq!(files(&folder), weights(&[1, 2, 3]));
     assert_eq!((announced(&versions), listed(&versions)), (before.clone(), listed_before.clone()));
-    // The file that was rolled back from lies there still.
+    // The checkpoint that was rolled back from is still in the folder.
     versions.take_in().unwrap();
     assert_eq!((announced(&versions), listed(&versions)), (before, listed_before));
     versions.publish("cpn", &checkpoint(4)).unwrap();
@@ -220,9 +220,9 @@ fn a_restart_changes_nothing() {
     assert_eq!(roll_back(&versions).unwrap(), 2, "what was promoted when is known still");
 }
 
-/// A clock that was set back does not make a later promotion an earlier one.
+/// Promotion times increase even if the clock is set back.
 #[test]
-fn promotions_outrun_the_clock() {
+fn promotion_times_increase_when_the_clock_is_set_back() {
     let folder = TempDir::new().unwrap();
     open(&folder, 5).publish("cpn", &checkpoint(1)).unwrap();
     let path = folder.path().join("versions/cpn/history.json");
@@ -236,7 +236,7 @@ fn promotions_outrun_the_clock() {
 }
 
 #[test]
-fn damaged_versions_give_way() {
+fn damaged_versions_are_dropped() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     for seed in 1..=3 {
@@ -259,7 +259,7 @@ fn damaged_versions_give_way() {
     assert_eq!(roll_back(&versions).unwrap(), 2);
     drop(versions);
 
-    // Of what was ever promoted and not rolled back nothing is left.
+    // No version that was promoted and not rolled back is left.
     std::fs::remove_file(path(2)).unwrap();
     let versions = open(&folder, 5);
     assert_eq!(listed(&versions), (vec![3], 3));
@@ -271,9 +271,9 @@ fn damaged_versions_give_way() {
     assert!(error.contains("versions/cpn: history.json: EOF"), "{error}");
 }
 
-/// What is said of versions holds of the weights on disk, also while the process runs that keeps them.
+/// Listed versions have their weights on disk, also if files change while the process runs.
 #[test]
-fn weights_that_went_are_not_promoted_and_come_back() {
+fn missing_weights_are_not_promoted_and_can_be_restored() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     for seed in 1..=2 {
@@ -301,7 +301,7 @@ fn weights_that_went_are_not_promoted_and_come_back() {
 }
 
 #[test]
-fn files_that_come_along_are_nobodys() {
+fn hidden_files_are_ignored() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     std::fs::write(folder.path().join("._cpn.safetensors"), checkpoint(1)).unwrap();
@@ -316,7 +316,7 @@ fn files_that_come_along_are_nobodys() {
 }
 
 #[test]
-fn faulty_checkpoints_are_refused_and_leave_nothing() {
+fn faulty_checkpoints_are_refused_without_traces() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     let good = checkpoint(1);
@@ -342,9 +342,9 @@ fn faulty_checkpoints_are_refused_and_leave_nothing() {
     assert!(versions.promoted().borrow().is_empty());
 }
 
-/// A file is looked at again once it is written anew, and one that is faulty keeps no other away.
+/// A rewritten file is read again, and a faulty one does not affect others.
 #[test]
-fn what_training_runs_write_is_taken_in() {
+fn checkpoints_of_training_runs_are_published() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     let path = |name: &str| folder.path().join(name);
@@ -367,13 +367,13 @@ fn what_training_runs_write_is_taken_in() {
     assert_eq!(versions_of(), [("cpn".into(), 1), ("upn".into(), 1), ("upn".into(), 2)]);
 }
 
-/// The signature of each version of the model "cpn".
+/// Signature of each version of the model "cpn".
 fn signatures(versions: &Versions) -> Vec<Option<String>> {
     let listed = versions.list(ListVersionsRequest { model: Some("cpn".into()) }).unwrap().versions;
     listed.into_iter().map(|version| version.manifest.signature_bundle).collect()
 }
 
-/// A signature may come before its checkpoint, with it or after it.
+/// A signature may be written before its checkpoint, with it or after it.
 #[test]
 fn a_signature_is_published_with_its_checkpoint() {
     let folder = TempDir::new().unwrap();
@@ -382,7 +382,7 @@ fn a_signature_is_published_with_its_checkpoint() {
     let write = |path: &Path, bytes: &[u8]| service_kit::files::write_atomically(path, bytes).unwrap();
     let [first, second] = [1, 2].map(|seed| bundle(1, &checkpoint(seed)));
 
-    // After it: the version stays, and is announced again with its signature.
+    // After: the version stays, and is announced again with its signature.
     write(&weights, &checkpoint(1));
     versions.take_in().unwrap();
     let mut watched = versions.promoted();
@@ -398,19 +398,19 @@ fn a_signature_is_published_with_its_checkpoint() {
     versions.take_in().unwrap();
     assert!(!watched.has_changed().unwrap(), "it is nothing new");
 
-    // Before it: that of other weights is passed over until these are there.
+    // Before: a signature of other weights is ignored until those are there.
     write(&signature, second.as_bytes());
     versions.take_in().unwrap();
     assert_eq!(signatures(&versions), [Some(first.clone())]);
     write(&weights, &checkpoint(2));
     versions.take_in().unwrap();
     assert_eq!(signatures(&versions), [Some(first.clone()), Some(second.clone())]);
-    // That of the weights before.
+    // The signature of the previous weights.
     write(&weights, &checkpoint(3));
     versions.take_in().unwrap();
     assert_eq!(signatures(&versions), [Some(first.clone()), Some(second.clone()), None]);
 
-    // Another key's takes its place; without a file the version keeps it, and through a restart.
+    // Another key's signature replaces it; the version keeps it without the file, and through a restart.
     let third = bundle(2, &checkpoint(3));
     for bundle in [bundle(1, &checkpoint(3)), third.clone()] {
         write(&signature, bundle.as_bytes());
@@ -427,7 +427,7 @@ fn a_signature_is_published_with_its_checkpoint() {
     assert_eq!(announced(&versions), announced_before);
 }
 
-/// A version that was rolled back from gets its signature, and stays where it is.
+/// A version that was rolled back from gets its signature, and is not promoted by it.
 #[test]
 fn a_signature_promotes_nothing() {
     let folder = TempDir::new().unwrap();
@@ -448,7 +448,7 @@ fn a_signature_promotes_nothing() {
 }
 
 #[test]
-fn what_is_no_signature_of_the_weights_is_passed_over() {
+fn signatures_of_other_weights_are_ignored() {
     let good = bundle(1, &checkpoint(1));
     let other = bundle(1, &checkpoint(2));
     for wrong in ["", "{}", "null", &good[..good.len() - 1], &other, &" ".repeat(70_000)] {
@@ -467,9 +467,9 @@ fn what_is_no_signature_of_the_weights_is_passed_over() {
     assert_eq!(signatures(&versions), [None]);
 }
 
-/// Histories of before there were signatures are read, and those of unsigned versions can be read by who knows none.
+/// Histories without signatures are read, and those of unsigned versions have no field that older releases would refuse.
 #[test]
-fn an_unsigned_history_says_nothing_of_signatures() {
+fn an_unsigned_history_has_no_signature_fields() {
     let folder = TempDir::new().unwrap();
     open(&folder, 5).publish("cpn", &checkpoint(1)).unwrap();
     let history = std::fs::read_to_string(folder.path().join("versions/cpn/history.json")).unwrap();

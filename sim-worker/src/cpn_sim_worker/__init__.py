@@ -2,11 +2,11 @@
 
 import os
 
-# Read when MuJoCo is imported, so this has to run before any module of the package does. An empty one counts as unset:
-# MuJoCo takes it for the backend that needs a display, or for a malformed number.
+# Set before any module of the package is imported, since MuJoCo reads these on import. Empty variables count as unset:
+# MuJoCo takes them for the backend that needs a display, or for a malformed number.
 for _variable in ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", "LP_NUM_THREADS"):
     if not os.environ.get(_variable):
         os.environ.pop(_variable, None)
 os.environ.setdefault("MUJOCO_GL", "egl")
-# llvmpipe, the software renderer: at 84 x 84 its worker threads cost more than they bring.
+# Threads of llvmpipe, the software renderer: at 84 x 84 pixels they cost more than they save.
 os.environ.setdefault("LP_NUM_THREADS", "0")

@@ -1,4 +1,4 @@
-"""The command line."""
+"""Command line of the simulator worker."""
 
 import logging
 import sys
@@ -19,14 +19,14 @@ Demonstrate = Annotated[DemonstrateConfig, tyro.conf.subcommand("demonstrate")]
 def main() -> None:
     """Runs the subcommand that the arguments name."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    # Zenoh's own log, where RUST_LOG asks for it.
+    # Zenoh's own log, as set by RUST_LOG.
     zenoh.try_init_log_from_env()
     try:
         match tyro.cli(Serve | Demonstrate, prog="cpn-sim-worker", config=(tyro.conf.OmitArgPrefixes,)):
             case ServeConfig() as config:
                 serve(config)
             case DemonstrateConfig() as config:
-                # It imports MuJoCo, which needs a library that may be missing.
+                # Imported late: it imports MuJoCo, whose OpenGL library may be missing.
                 load_mujoco()
                 from cpn_sim_worker.demonstrate import demonstrate
 

@@ -25,7 +25,7 @@ from cpn_sim_worker.wire import RequestError, action_to_proto, image_to_proto
 
 @dataclass(frozen=True)
 class Try:
-    """What became of one variation."""
+    """Outcome of one variation."""
 
     task: str
     kept: bool
@@ -33,13 +33,13 @@ class Try:
 
 
 def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: int) -> None:
-    """Solves a variation and sends it, unless the trainer holds it already.
+    """Solves a variation and sends the episode, unless the trainer has stored it already.
 
     Raises:
         ExpertFailedError: If the expert does not solve the variation.
         EpisodeLostError: If steps stay missing.
-        RequestError: If the trainer refuses the episode, or holds it in another rendering.
-        UnavailableError: If the trainer stays away.
+        RequestError: If the trainer refuses the episode, or has stored it with another render spec.
+        UnavailableError: If the trainer stays unavailable.
     """
     episode_id = f"{task}-{seed}"
     simulator.load(task)
@@ -73,8 +73,8 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
 def _run_tasks(
     config: DemonstrateConfig, tasks: "multiprocessing.Queue[str | None]", tries: "multiprocessing.Queue[Try]"
 ) -> None:
-    """What one process does: all episodes of a task, then of the next, until it is handed None."""
-    # An interrupt from the terminal reaches every process; the parent's is the one to act.
+    """Main function of a worker process: all episodes of one task after the other, until the queue yields None."""
+    # An interrupt from the terminal reaches every process; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         simulator = Simulator(Renderer())
@@ -96,7 +96,7 @@ def _run_tasks(
 
 
 def demonstrate(config: DemonstrateConfig) -> None:
-    """Streams the demonstrations of every task and prints what became of the tries."""
+    """Streams the demonstrations of all tasks, and prints the numbers of episodes and rejected variations."""
     # Spawned, not forked: neither a GL context nor a zenoh session survives a fork.
     context = multiprocessing.get_context("spawn")
     tasks: multiprocessing.Queue[str | None] = context.Queue()
@@ -105,12 +105,14 @@ def demonstrate(config: DemonstrateConfig) -> None:
         context.Process(target=_run_tasks, args=(config, tasks, tries), daemon=True)
         for _ in range(min(config.processes, len(config.tasks)))
     ]
+
     for task in (*config.tasks, *(None for _ in processes)):
         tasks.put(task)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit("interrupted; run the same command again to resume"))
     for process in processes:
         process.start()
+
     tally: Counter[Try] = Counter()
     try:
         with tqdm(total=len(config.tasks) * config.episodes, unit="episode") as progress:

@@ -1,4 +1,4 @@
-"""The one running episode of a worker: the requests' meaning, whatever carries them."""
+"""Running episode of a worker: handling of its requests, independent of the transport."""
 
 from dataclasses import dataclass
 from uuid import uuid4
@@ -15,7 +15,7 @@ from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto,
 
 @dataclass(frozen=True)
 class _Applied:
-    """The latest step, kept to answer its repetition."""
+    """Latest step, kept to answer a repeated request."""
 
     action: NDArray[np.float32]
     response: sim_pb2.StepResponse
@@ -31,7 +31,7 @@ class _Episode:
 
 
 class EpisodeRunner:
-    """Runs one episode after the other on one simulator."""
+    """Episodes on one simulator, one at a time."""
 
     def __init__(self, simulator: Simulator, max_steps: int) -> None:
         self._simulator = simulator
@@ -48,12 +48,14 @@ class EpisodeRunner:
         except MissingExtraError as error:
             code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
             raise RequestError(code, "variation.task", error.expected, error.got) from None
+
         self.abandon()
-        # Even where the goal is another's: so the same variations can be asked for with either goal.
+        # Also with another seed's goal, so that the same variations are valid with either goal.
         self._solve(task, seed, "variation.seed")
         if request.HasField("goal_seed"):
             self._solve(task, request.goal_seed, "goal_seed")
         goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
+
         state = self._simulator.reset(task, seed)
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
         return sim_pb2.ResetResponse(
@@ -66,11 +68,12 @@ class EpisodeRunner:
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
-        """Applies an action exactly once; the flag tells whether it was applied now or only answered again."""
+        """Applies an action exactly once; the flag is False for the repeated answer to a repeated request."""
         episode = self._episode
         if episode is None or request.episode_id != episode.id:
             running = "an episode started by a reset" if episode is None else repr(episode.id)
             raise RequestError(types_pb2.ERROR_CODE_NOT_FOUND, "episode_id", running, repr(request.episode_id))
+
         action = action_from_proto(request.action, self._simulator.scene.action_size, "action")
         latest = episode.latest
         if latest is not None and request.step == episode.steps - 1 and np.array_equal(action, latest.action):
@@ -84,6 +87,7 @@ class EpisodeRunner:
             )
         if request.step != episode.steps:
             raise RequestError(types_pb2.ERROR_CODE_FAILED_PRECONDITION, "step", episode.steps, request.step)
+
         transition = self._simulator.step(action)
         episode.steps += 1
         episode.success |= transition.success
@@ -99,11 +103,11 @@ class EpisodeRunner:
         return response, True
 
     def abandon(self) -> None:
-        """Ends the running episode, if any: further steps of it are refused."""
+        """Ends the running episode, if any; its further steps are refused."""
         self._episode = None
 
     def _solve(self, task: str, seed: int, field: str) -> None:
-        """Leaves the simulator at the end of the expert's run; `field` names the seed in a `RequestError`."""
+        """Runs the expert, and leaves the simulator at the end; `field` names the seed in a `RequestError`."""
         try:
             for _ in solve(self._simulator, task, seed):
                 pass

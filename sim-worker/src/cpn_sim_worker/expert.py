@@ -10,12 +10,12 @@ from cpn_sim_worker.scene import Transition
 from cpn_sim_worker.simulator import Simulator
 
 MAX_EXPERT_STEPS = 200
-"""Twice what most experts need."""
+"""Step limit of an expert: twice the steps of most."""
 
 HOLD_STEPS = 3
-"""How long the arm rests after the first success, so that the goal image shows the finished task at rest and a policy
-trained on it learns to stop there. The hand trails its set point: after more than five steps handle-press has sunk
-past its target and no longer counts as solved."""
+"""Steps at rest after the first success, so that the goal image shows the finished task at rest and a policy trained on
+it learns to stop there. The hand lags behind its set point: after more than five steps handle-press has sunk past its
+target and no longer counts as solved."""
 
 
 class ExpertFailedError(Exception):
@@ -29,19 +29,19 @@ class ExpertFailedError(Exception):
 
 @dataclass(frozen=True)
 class Moment:
-    """A step of an episode, before its action."""
+    """Step of an episode, before its action."""
 
     arrival: Transition
-    """The state, and what the action before brought; a reward of 0 at the first step."""
+    """State, with the reward and success of the previous action; a reward of 0 at the first step."""
     action: NDArray[np.float32] | None
-    """What the expert does next, [A] in [-1, 1]; None at the end."""
+    """Next action of the expert, [A] in [-1, 1]; None at the end."""
 
 
 def solve(simulator: Simulator, task: str, seed: int) -> Iterator[Moment]:
-    """Solves a variation, and lets the caller look at `simulator` before every action and at the end.
+    """Solves a variation; yields before every action and at the end, with `simulator` in the state of that step.
 
     Raises:
-        ExpertFailedError: If the task is not solved in time, or not at rest.
+        ExpertFailedError: If the task is not solved within the step limit, or no longer solved at rest.
     """
     arrival = Transition(simulator.reset(task, seed), reward=0, success=False)
     action = np.empty(0, np.float32)
@@ -51,7 +51,8 @@ def solve(simulator: Simulator, task: str, seed: int) -> Iterator[Moment]:
         arrival = simulator.step(action)
         if arrival.success:
             break
-    # The hand rests, the gripper keeps its grip.
+
+    # The hand rests, and the gripper keeps its grip.
     hold = np.append(np.zeros(3, np.float32), action[3:])
     for _ in range(HOLD_STEPS):
         yield Moment(arrival, hold)

@@ -1,6 +1,6 @@
-"""The health of a worker, for the health checks of containers: whether the network knows its liveliness token.
+"""Health check of a worker, for containers: whether its liveliness token is visible in the network.
 
-A module of its own that imports neither simulator nor renderer, because it runs every few seconds.
+Imports neither simulator nor renderer, since it runs every few seconds.
 """
 
 import os
@@ -15,9 +15,9 @@ from cpn_sim_worker import keys
 from cpn_sim_worker.session import ConfigError, NoRouterError, ZenohConfig, look_in
 
 PATIENCE_SECONDS = 4.0
-"""Longest check, beside the start of the process."""
+"""Timeout of the check, without the start of the process."""
 PAUSE_SECONDS = 0.1
-"""Pause between two questions."""
+"""Pause between two queries."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class HealthConfig:
 
 
 def fault(config: HealthConfig, patience_seconds: float = PATIENCE_SECONDS) -> str | None:
-    """Why the worker is not ready; None if it is."""
+    """Reason why the worker is not ready; None if it is."""
     end = time.monotonic() + patience_seconds
     key = keys.sim_alive(config.worker)
     try:
@@ -41,7 +41,7 @@ def fault(config: HealthConfig, patience_seconds: float = PATIENCE_SECONDS) -> s
             while (left := end - time.monotonic()) > 0:
                 if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=left)):
                     return None
-                # A router knows everybody; peers find each other one by one.
+                # A router knows all tokens at once; peers discover each other one by one.
                 if session.info.routers_zid():
                     break
                 time.sleep(PAUSE_SECONDS)
@@ -51,15 +51,15 @@ def fault(config: HealthConfig, patience_seconds: float = PATIENCE_SECONDS) -> s
 
 
 def main() -> None:
-    """Checks the worker that the arguments name."""
+    """Runs `cpn-sim-worker-health`."""
     try:
         config = tyro.cli(HealthConfig, prog="cpn-sim-worker-health", config=(tyro.conf.OmitArgPrefixes,))
     except ConfigError as error:
         sys.exit(str(error))
     except SystemExit as end:
-        # Docker reserves 2, with which arguments at fault would end.
+        # Docker reserves exit code 2, which invalid arguments would give.
         sys.exit(1 if end.code else 0)
     if reason := fault(config):
         print(f"worker {config.worker} is not ready: {reason}", file=sys.stderr, flush=True)
-        # Not by way of the interpreter's end, which a thread still inside `zenoh.open` may abort.
+        # Without the interpreter's shutdown, which a thread inside `zenoh.open` could abort.
         os._exit(1)

@@ -1,7 +1,7 @@
-"""Every zenoh key of the project, general to specific.
+"""All zenoh key expressions of the project.
 
-The verbatim chunk `@v1` seals the version: `cpn/**` does not match it. `tests/golden/keys.json` at the root of the
-repository holds this module and its Rust twin together.
+The verbatim chunk `@v1` is the protocol version: `cpn/**` does not match it. `tests/golden/keys.json` at the root of
+the repository keeps this module and its Rust counterpart in step.
 """
 
 ROOT = "cpn/@v1"

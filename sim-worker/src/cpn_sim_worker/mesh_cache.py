@@ -1,7 +1,7 @@
-"""Decimated meshes, kept between processes.
+"""Cache of decimated meshes on disk.
 
-The cache is a convenience. Its folder may be missing, full, read-only or another user's, and its files may be cut by a
-power failure: meshes are decimated all the same, damaged files are replaced, and one warning says where.
+The cache is optional: its folder may be missing, full, read-only or another user's, and its files may be truncated by a
+power failure. Meshes are then decimated anew, damaged files are replaced, and one warning names the path.
 """
 
 import logging
@@ -21,19 +21,19 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh in its own frame, as MuJoCo lays it out."""
+    """Mesh in its own frame, in MuJoCo's layout."""
 
     vertices: NDArray[np.float32]
     """[V, 3]."""
     faces: NDArray[np.int32]
     """[F, 3], into the vertices."""
     corners: NDArray[np.int32]
-    """[F, 3], the corner of the original mesh, 0 to 3 F', whose normal and texture each corner takes."""
+    """[F, 3], corners of the original mesh, 0 to 3 F', from which each corner takes its normal and texture."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a mesh has at most."""
+    """Upper bounds of a mesh's sizes."""
 
     vertices: int
     faces: int
@@ -60,11 +60,11 @@ class Bounds:
 
 
 def decimate_once(digest: str, bounds: Bounds, decimate: Callable[[], Mesh]) -> Mesh:
-    """The mesh that is kept under the digest of everything it depends on; decimates it first if there is none."""
+    """Cached mesh, under the digest of all its inputs; decimated and stored first if there is none."""
     try:
         folder = user_cache_path("cpn") / "meshes"
     except RuntimeError as error:
-        # There is no home, as in a container whose user its list of users does not have.
+        # No home folder, as in a container whose user is not in its list of users.
         _warn("used", Path("~/.cache/cpn/meshes"), str(error))
         return decimate()
 
@@ -78,7 +78,7 @@ def decimate_once(digest: str, bounds: Bounds, decimate: Callable[[], Mesh]) -> 
 
 def _read(path: Path, bounds: Bounds) -> Mesh | None:
     try:
-        # Whatever else may lie there: opening a pipe would wait for ever.
+        # Opening a pipe, for example, would block for ever.
         if not stat.S_ISREG(path.stat().st_mode):
             raise ValueError("expected a file")
         with np.load(path, allow_pickle=False) as archive:
@@ -86,7 +86,7 @@ def _read(path: Path, bounds: Bounds) -> Mesh | None:
         bounds.check(mesh)
     except FileNotFoundError:
         return None
-    # A damaged file surfaces as whatever the layer that meets the damage raises: zipfile, zlib, NumPy's header parser.
+    # A damaged file raises errors of several layers: zipfile, zlib, NumPy's header parser.
     except Exception as error:
         _warn("read", path, _reason(error))
         return None
@@ -94,16 +94,16 @@ def _read(path: Path, bounds: Bounds) -> Mesh | None:
 
 
 def _write(path: Path, mesh: Mesh) -> None:
-    # Several workers may decimate the same mesh at once: each writes its own file, and the last one stays.
+    # Workers that decimate the same mesh at once write files of their own, and the last rename wins.
     partial = path.with_name(f".{path.stem}-{uuid4().hex[:12]}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            # With the permissions that the umask gives, so that others who share the cache can read it.
+            # Default permissions, unlike tempfile's, so that other users of a shared cache can read the file.
             with partial.open("xb") as file:
                 np.savez(file, vertices=mesh.vertices, faces=mesh.faces, corners=mesh.corners)
                 file.flush()
-                # Before the name is there: a power failure would leave an empty file under it.
+                # Before the rename, since a power failure could leave an empty file under the name.
                 os.fsync(file.fileno())
             partial.replace(path)
         finally:
@@ -117,11 +117,11 @@ def _reason(error: Exception) -> str:
 
 
 def _warn(action: str, path: Path, reason: str) -> None:
-    """Names the first file of a folder: where one cannot be used, others hardly can either."""
+    """Warns once per action and folder, with the first file."""
     if (action, path.parent) not in _warned:
         _warned.add((action, path.parent))
         log.warning("mesh cache: %s cannot be %s: %s; meshes are decimated anew", path, action, reason)
 
 
 _warned: set[tuple[str, Path]] = set()
-"""What was warned of, by action and folder."""
+"""Warnings given, by action and folder."""

@@ -1,6 +1,6 @@
-"""Fewer faces for the meshes of a model that is only looked at.
+"""Decimation of meshes for rendering.
 
-A software renderer spends its time on vertices, and Sawyer's arm has more faces than the whole picture has pixels.
+The time of a software renderer is spent on vertices, and Sawyer's arm has more faces than the image has pixels.
 """
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
@@ -21,32 +21,32 @@ from cpn_sim_worker.mesh_cache import Bounds, Mesh, decimate_once
 from cpn_sim_worker.render_spec import installed_version
 
 LIBRARIES = ("fast-simplification", "numpy", "scipy")
-"""Names of the packages that decide what a mesh is decimated to."""
+"""Names of the packages that determine a decimated mesh."""
 
 
 @dataclass(frozen=True)
 class Decimation:
-    """How meshes are decimated."""
+    """Settings of mesh decimation."""
 
     max_faces: int = 1000
-    """Faces that a mesh may have. `make bench-sim` holds the mean SSIM of every task's pictures to the undecimated ones
-    to 0.97."""
+    """Maximum number of faces of a mesh. `make bench-sim` requires a mean SSIM of 0.97 to the undecimated images, for
+    each task."""
     min_aggressiveness: int = 3
-    """Of the quadric decimation, tried first: less spends the faces better, more comes down to fewer."""
+    """First aggressiveness of the quadric decimation: lower values distribute faces better, higher ones reach fewer."""
     max_aggressiveness: int = 10
-    """Tried last."""
+    """Last aggressiveness tried."""
     neighbours: int = 24
-    """Original corners that a new corner takes its normal from: the nearest ones."""
+    """Number of nearest original corners among which a new corner chooses its normal."""
     distance_weight: float = 0.5
-    """What an original corner loses by being an edge away, where one whose normal is at right angles to the new face's
-    loses 1."""
+    """Penalty of an original corner at a distance of one edge, where 1 is that of a normal orthogonal to the new
+    face's."""
 
 
 def decimated(model: mujoco.MjModel, decimation: Decimation) -> mujoco.MjModel:
-    """A copy of a model to be rendered, in which no mesh has more than `decimation.max_faces` faces.
+    """Copy of a model for rendering, in which no mesh has more than `decimation.max_faces` faces.
 
-    Positions, sizes and counts of all bodies and geoms stay as they are, so that the data of the original model shows
-    the copy as well. The copy is for rendering only: the physics keeps the original.
+    Positions, sizes and counts of all bodies and geoms are unchanged, so that the original model's data can be rendered
+    with the copy. The physics keeps the original.
     """
     light = copy.copy(model)
     for mesh in range(model.nmesh):
@@ -78,7 +78,7 @@ def _range(first: int, count: int) -> slice:
 def _decimate(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], decimation: Decimation
 ) -> Mesh:
-    """Decimates a mesh of vertices [V, 3], faces [F, 3] and corner normals [F, 3, 3], or finds it in the cache."""
+    """Decimates a mesh of vertices [V, 3], faces [F, 3] and corner normals [F, 3, 3], by way of the cache."""
     versions = {package: installed_version(package) for package in LIBRARIES}
     digest = hashlib.sha256(json.dumps([asdict(decimation), versions]).encode())
     for array in (vertices, faces, normals):
@@ -95,7 +95,7 @@ def _decimate(
 def _merge_equal_vertices(
     vertices: NDArray[np.float32], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Joins the faces of a mesh whose vertices are not shared, which a decimation would tear apart."""
+    """Merges equal vertices, since decimation would tear apart faces that do not share theirs."""
     merged, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index[faces].astype(np.int32)
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
@@ -133,9 +133,9 @@ def _nearest_corners(
     normals: NDArray[np.float32],
     decimation: Decimation,
 ) -> NDArray[np.int32]:
-    """For each new corner, [F, 3], the original corner nearby whose normal fits the new face best.
+    """Nearby original corner with the normal that fits best, for each corner of the new faces, [F, 3].
 
-    So round parts stay smooth and edges stay sharp: flat facets, not missing detail, are what would catch the eye.
+    Round parts then stay smooth and edges sharp; flat facets would be more visible than the missing detail.
     """
     tree = KDTree(vertices[faces].reshape(-1, 3))
     distances, candidates = map(np.asarray, tree.query(new_vertices, k=decimation.neighbours))

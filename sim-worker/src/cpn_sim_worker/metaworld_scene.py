@@ -1,4 +1,4 @@
-"""A Meta-World task whose variation depends on (task, seed) alone."""
+"""Meta-World tasks, with variations that depend on (task, seed) alone."""
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules, and Meta-World adds `seed` to its constructors at run time.
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
@@ -17,12 +17,12 @@ from cpn_sim_worker.scene import Camera, Transition
 
 
 class MetaWorldScene:
-    """One of Meta-World's tabletop tasks with the Sawyer arm.
+    """Meta-World tabletop task with the Sawyer arm.
 
     States are [39]: hand, gripper, objects, the same one step earlier, goal.
     """
 
-    # The close pose, in which 84 pixels still resolve a handle. Meta-World hangs it upside down.
+    # Close pose, in which 84 pixels still resolve a handle. Meta-World mounts this camera upside down.
     camera = Camera("corner4", flip="columns")
     libraries = ("metaworld",)
     revision = ""
@@ -31,28 +31,28 @@ class MetaWorldScene:
 
     def __init__(self, task: str) -> None:
         self._task = task
-        # "Goal observable" shows the goal to the scripted expert; nothing else of the state reaches a policy.
-        # This seed has no effect on variations: it keeps the constructor off NumPy's global generator.
+        # "Goal observable" variants put the goal into the state, for the scripted expert only. This seed does not
+        # affect variations; it keeps the constructor from using NumPy's global generator.
         self._env: SawyerXYZEnv = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
         self.control_hz = 1 / self._env.dt
         self.goal_position = np.empty(0)
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled model."""
+        """Compiled model."""
         return self._env.model
 
     @property
     def data(self) -> mujoco.MjData:
-        """The state of the physics."""
+        """State of the physics."""
         return self._env.data
 
     def reset(self, seed: int) -> NDArray[np.float64]:
-        """Starts the variation that `seed` draws; returns the state, [39].
+        """Starts the variation of `seed`; returns the state, [39].
 
-        Meta-World's own `reset(seed)` ignores the seed. Some tasks redraw until their objects are far enough apart,
-        so the task draws from our generator first, and then resets with the vector that it accepted: `reset` places
-        the objects twice, and with two different vectors would return the first one's observations.
+        Meta-World's own `reset(seed)` ignores the seed. Some tasks redraw until their objects are far enough apart, so
+        the task first draws from our generator, and is then reset with the accepted vector: `reset` places the objects
+        twice, and with two different vectors would return the observations of the first.
         """
         env = self._env
         env.np_random = np.random.Generator(np.random.PCG64([zlib.crc32(self._task.encode()), seed]))
@@ -61,8 +61,9 @@ class MetaWorldScene:
         env.reset_model()
         env._freeze_rand_vec = True
         env.reset()
-        # Some tasks move an object last and leave its geometry where it was: the first frame would show it there, and
-        # `reset` has told of it so.
+
+        # Some tasks move an object last without updating its geometry, so that the first frame, and the observation
+        # that `reset` returned, would have the old position.
         mujoco.mj_forward(env.model, env.data)
         env._prev_obs = env._get_curr_obs_combined_no_goal()
         self._policy = ENV_POLICY_MAP[f"{self._task}-v3"]()
@@ -74,8 +75,8 @@ class MetaWorldScene:
         return Transition(state, float(reward), bool(info["success"]))
 
     def expert(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The scripted policy's next action, [4] in [-1, 1]."""
+        """Next action of the scripted policy, [4] in [-1, 1]."""
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Constant.s. may be too high")
-            # A copy, because some policies write into what they are given.
+            # A copy, because some policies modify their argument.
             return np.clip(self._policy.get_action(state.copy()), -1, 1).astype(np.float32)

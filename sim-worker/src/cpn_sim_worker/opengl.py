@@ -1,7 +1,7 @@
-"""OpenGL, which MuJoCo loads when it is imported, by the backend that MUJOCO_GL names.
+"""OpenGL backend of MuJoCo, which loads the one that MUJOCO_GL names when it is imported.
 
-A module of its own that imports nothing heavy: what is missing comes up at the first import of MuJoCo, as an error that
-does not say what to install.
+Without heavy imports, so that it can be used first: if a library is missing, the first import of MuJoCo fails with an
+error that does not say what to install.
 """
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
@@ -19,11 +19,11 @@ BACKENDS = {
     "osmesa": "install libosmesa6, or set MUJOCO_GL=egl",
     "glfw": "set DISPLAY to that of a running X server; without one set MUJOCO_GL=egl or MUJOCO_GL=osmesa",
 }
-"""Each with what to do if it does not work; packages by their names in Debian."""
+"""Backends, each with the remedy if it does not work; packages by their Debian names."""
 
 
 class OpenGLError(Exception):
-    """OpenGL that is missing or does not draw; tells what to set or install."""
+    """OpenGL is missing or does not draw; the message has the remedy."""
 
     def __init__(self, reason: object) -> None:
         super().__init__(f"MUJOCO_GL: expected {_backend()} to draw, got {reason}: {BACKENDS[_backend()]}")
@@ -33,15 +33,15 @@ def load_mujoco() -> None:
     """Imports MuJoCo.
 
     Raises:
-        OpenGLError: If the backend's library is not there.
-        ConfigError: If there is no such backend, or another variable contradicts it.
+        OpenGLError: If the backend's library is missing.
+        ConfigError: If the backend is unknown, or another variable contradicts it.
     """
     if _backend() not in BACKENDS:
         raise ConfigError(f"MUJOCO_GL: expected one of {', '.join(BACKENDS)}, got {os.environ['MUJOCO_GL']!r}")
     platform = os.environ.get("PYOPENGL_PLATFORM")
     if platform and _backend() != "glfw" and platform.lower() != _backend():
         raise ConfigError(f"PYOPENGL_PLATFORM: expected {_backend()}, as MUJOCO_GL, or none, got {platform!r}")
-    # It tells at every start that it goes without an accelerator, which nobody needs.
+    # PyOpenGL reports at every start that it has no accelerator module, which is not needed.
     logging.getLogger("OpenGL").setLevel(logging.WARNING)
     try:
         import mujoco  # noqa: F401
@@ -50,23 +50,24 @@ def load_mujoco() -> None:
 
 
 def open_context(width: int, height: int) -> Any:  # noqa: ANN401
-    """MuJoCo's context of the backend, current in this thread.
+    """OpenGL context of the backend, made current in this thread.
 
     Raises:
-        OpenGLError: If there is no device or display, or it cannot draw.
+        OpenGLError: If there is no device or display, or no context can be created.
     """
     from mujoco.gl_context import GLContext
 
-    # One whose constructor fails is freed all the same, and would complain of what it has not yet.
+    # The destructor runs even if the constructor failed, and would miss this attribute.
     GLContext._context = None
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always")
         try:
             context = GLContext(width, height)
-        # Each backend raises another library's errors.
+        # Each backend raises errors of a different library.
         except Exception as error:
             raise OpenGLError(error) from error
-    # GLFW does not raise: the first use would abort the process.
+
+    # GLFW does not raise; the first use would abort the process.
     if not context._context:
         raise OpenGLError(complaints[0].message if complaints else "no context")
     try:

@@ -1,4 +1,4 @@
-"""Options of the subcommands. They import no simulator, which loads while a worker joins its network."""
+"""Options of the subcommands. Imports no simulator, which a worker loads while it joins its network."""
 
 import os
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from cpn_sim_worker.session import ZenohConfig
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, check_task
 
 MAX_STEPS = 500
-"""Steps after which Meta-World's environments refuse to go on; Jenga would."""
+"""Largest step limit: Meta-World's environments refuse further steps, unlike Jenga."""
 
 
 @dataclass(frozen=True)

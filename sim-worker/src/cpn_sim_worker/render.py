@@ -1,4 +1,4 @@
-"""Camera images of a scene."""
+"""Rendering of a scene's camera images."""
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
@@ -22,18 +22,18 @@ MAX_GEOMS = 1000
 DECIMATION = Decimation()
 
 TESSELLATION = (2, 16, 8)
-"""About half of MuJoCo's own quads, slices and stacks, wherever meshes are decimated."""
+"""Quads, slices and stacks of primitive shapes if meshes are decimated: about half of MuJoCo's defaults."""
 
 
 class Renderer:
-    """Draws one scene at a time; call it from one thread only.
+    """Offscreen renderer of one scene at a time, for use from a single thread.
 
-    Each `mujoco.Renderer` brings a GL context, and a second one in a process returns stale or garbage frames without
-    an error. So here one GL context lives as long as the process, and a new model replaces the resources of the one
-    before in that same context.
+    Each `mujoco.Renderer` creates a GL context, and a second one in a process returns stale or garbage frames without
+    an error. Here a single GL context lives as long as the process, and a new model replaces the resources of the
+    previous one in it.
 
-    What is drawn is a copy of the scene's model, which the physics never sees: a lighter one, unless `decimation` is
-    None.
+    It draws a copy of the scene's model, with decimated meshes unless `decimation` is None; the physics keeps the
+    original.
     """
 
     _exists: ClassVar[bool] = False
@@ -46,7 +46,7 @@ class Renderer:
         Renderer._exists = True
         self._viewport = mujoco.MjrRect(0, 0, IMAGE_SIZE, IMAGE_SIZE)
         self._option = mujoco.MjvOption()
-        # Sites are markers of no substance, and among them are the coloured goals that would give the task away.
+        # Sites are markers without physics; some are coloured goals, which would leak the task's solution.
         self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -54,7 +54,7 @@ class Renderer:
         self._context: mujoco.MjrContext | None = None
 
     def spec(self, scene: Scene) -> RenderSpec:
-        """How `render` draws a scene."""
+        """Render spec of a scene's images."""
         packages = ("mujoco", *scene.libraries, *(LIBRARIES if self._decimation else ()))
         return RenderSpec(
             camera=scene.camera.name,
@@ -79,7 +79,7 @@ class Renderer:
         if self._context is not None:
             self._context.free()
         model = decimated(scene.model, self._decimation) if self._decimation else copy.copy(scene.model)
-        # Shadows, reflections and multisampling would take most of a software renderer's time.
+        # Without shadows, reflections and multisampling, which would take most of a software renderer's time.
         quality = model.vis.quality
         quality.offsamples = quality.shadowsize = 0
         quality.numquads, quality.numslices, quality.numstacks = self._tessellation(scene)
@@ -98,14 +98,14 @@ class Renderer:
         return self._context
 
     def render(self, scene: Scene) -> NDArray[np.uint8]:
-        """The scene as its camera sees it: [84, 84, 3], RGB, rows from the top, not mirrored."""
+        """Camera image of the scene, [84, 84, 3], RGB, rows from the top, not mirrored."""
         context = self._context if self._context is not None and scene is self._scene else self._load(scene)
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, scene.data, self._option, None, self._camera, everything, self._drawing)
         mujoco.mjr_render(self._viewport, self._drawing, context)
         pixels = np.empty((IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._viewport, context)
-        # GL's rows run from the bottom. Of a camera that hangs upside down the rows come right by that, while its
-        # columns run from right to left.
+        # GL's rows start at the bottom. For a camera mounted upside down that gives rows from the top, but columns from
+        # the right.
         flipped = pixels[::-1] if scene.camera.flip == "rows" else pixels[:, ::-1]
         return np.ascontiguousarray(flipped)

@@ -1,7 +1,8 @@
-"""How a picture was rendered, written down beside the picture.
+"""Render spec: camera and renderer configuration of an image.
 
-A network trained on one rendering and shown another sees a difference that no shape or type gives away. So every image
-carries the spec of its rendering, recordings and checkpoints keep it, and whoever would bring two together compares.
+A network shown images of another rendering than its training data's fails without an error of shape or type. Every
+image therefore carries its render spec; recordings and checkpoints store it, and images are only combined if their
+specs agree.
 """
 
 import json
@@ -12,7 +13,7 @@ from importlib.metadata import version
 
 @dataclass(frozen=True)
 class RenderSpec:
-    """Everything that decides the pixels of a state, but for the GL driver: two drivers differ by rounding."""
+    """All settings that determine the pixels of a state, except the GL driver: drivers differ by rounding."""
 
     camera: str
     flip: str
@@ -23,25 +24,25 @@ class RenderSpec:
     reflections: bool
     multisamples: int
     decimation: dict[str, float] | None
-    """The settings of `meshes.Decimation`; None if meshes are drawn as they are."""
+    """Settings of `meshes.Decimation`; None for undecimated meshes."""
     tessellation: tuple[int, int, int]
     """Quads along the side of a box or plane; slices and stacks of a sphere or cylinder."""
     revision: str
-    """Of the scene, where no package's version tells it."""
+    """Revision of the scene; empty if a package's version determines it."""
     versions: dict[str, str]
-    """Of every package that the pixels depend on."""
+    """Versions of all packages that the pixels depend on."""
 
     def __str__(self) -> str:
-        """The spec as JSON, the same text for the same spec."""
+        """Canonical JSON of the spec."""
         return self._json
 
     @cached_property
     def _json(self) -> str:
-        """Made once, since every frame carries it."""
+        """JSON, cached since every frame carries it."""
         return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
 
 
 @cache
 def installed_version(package: str) -> str:
-    """The version of a package; looking it up takes as long as a frame."""
+    """Version of a package, cached since the lookup takes as long as a frame."""
     return version(package)

@@ -1,4 +1,4 @@
-"""What a simulator can host."""
+"""Interface of the scenes that a simulator hosts."""
 
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
@@ -13,71 +13,72 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Transition:
-    """What one action led to."""
+    """Outcome of one action."""
 
     state: NDArray[np.float64]
-    """[S], what the simulator knows of itself: the hand's position first, in metres, then the gripper's opening."""
+    """[S], state of the simulator: the hand's position in metres, the gripper's opening, then the scene's own
+    values."""
     reward: float
     success: bool
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A fixed camera of a model."""
+    """Fixed camera of a model."""
 
     name: str
     flip: Literal["rows", "columns"]
-    """The axis to reverse in what GL draws from the bottom up: the columns if the camera hangs upside down."""
+    """Axis to reverse in GL's images, whose rows start at the bottom: the columns for a camera mounted upside down."""
 
 
 class Scene(Protocol):
-    """A task's physics, whose variations depend on their seed alone, and its scripted expert."""
+    """Physics and scripted expert of a task, with variations that depend on the seed alone."""
 
     @property
     def camera(self) -> Camera:
-        """Where pictures are taken from."""
+        """Camera of the images."""
         ...
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Names of the packages that the pictures depend on, besides MuJoCo."""
+        """Names of the packages that the images depend on, besides MuJoCo."""
         ...
 
     @property
     def revision(self) -> str:
-        """Tells apart the scene's own states of development; empty if the version of a library does."""
+        """Revision of the scene's own files; empty if the version of a library determines them."""
         ...
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """Length A of an action."""
         ...
 
     @property
     def control_hz(self) -> float:
-        """Actions per second of simulated time."""
+        """Control rate, in actions per second of simulated time."""
         ...
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled model."""
+        """Compiled model."""
         ...
 
     @property
     def data(self) -> mujoco.MjData:
-        """The state of the physics."""
+        """State of the physics."""
         ...
 
     @property
     def goal_position(self) -> NDArray[np.float64]:
-        """Where the goal of the running variation is, [3] in metres; [0] for tasks whose goal is a picture."""
+        """Goal position of the running variation, [3] in metres; [0] for tasks with a goal image."""
         ...
 
     def reset(self, seed: int) -> NDArray[np.float64]:
-        """Starts the variation that `seed` draws; returns the state, [S].
+        """Starts the variation of `seed`; returns the state, [S].
 
         Raises:
-            SeedError: If there is no such variation.
+            SeedError: If the seed has no variation.
         """
         ...
 
@@ -86,5 +87,5 @@ class Scene(Protocol):
         ...
 
     def expert(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The scripted expert's next action in a state, [A] in [-1, 1]."""
+        """Next action of the scripted expert in a state, [A] in [-1, 1]."""
         ...

@@ -1,4 +1,4 @@
-"""Serves one simulator over zenoh."""
+"""Zenoh server of one simulator."""
 
 from __future__ import annotations
 
@@ -32,36 +32,36 @@ log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 
 QUEUE_LENGTH = 8
-"""Requests that may wait. One evaluator asks one worker at a time, so more than a few is a client out of control."""
+"""Maximum number of waiting requests. A worker serves one evaluator at a time, so a longer queue is a faulty client."""
 
 POLL_SECONDS = 0.1
-"""How long a signal to stop may go unnoticed while no request comes."""
+"""Interval at which the signal to stop is checked while there are no requests."""
 
 FIRST_TASK = "reach"
-"""Task of the frame that is drawn before anybody asks."""
+"""Task of the test frame that is drawn before the worker is ready."""
 
 LEASE_SECONDS = 15.0
-"""Time that the token of a worker that has died may linger: zenoh's lease, 10 s, and some more."""
+"""Longest time for which a dead worker's token lingers: zenoh's lease, 10 s, with a margin."""
 ANSWER_SECONDS = 2.0
-"""Time that the network has to name the holders of a token."""
+"""Timeout of a query for the holders of a token."""
 MEETING_SECONDS = 1.5
-"""Time after a change of connections in which others may still be joining: peers find each other one by one, and come
-back one by one to a router that was started again."""
+"""Settling time after a change of connections: peers discover each other, and reconnect to a restarted router, one by
+one."""
 
 
 class NameTakenError(Exception):
-    """A worker's name that another worker has."""
+    """Another worker has the name."""
 
 
 def claim_name(
     session: zenoh.Session, worker: str, stop: threading.Event, patience_seconds: float = LEASE_SECONDS
 ) -> None:
-    """Waits until no other worker has the name: two would each get a part of the requests.
+    """Waits until no other worker has the name, since each of two would get a part of the requests.
 
-    A worker that joins the network later than this one looks goes unnoticed.
+    A worker that joins the network after this check goes unnoticed.
 
     Raises:
-        NameTakenError: If another worker still has it after `patience_seconds`.
+        NameTakenError: If another worker still has the name after `patience_seconds`.
         StoppedError: If `stop` was set meanwhile.
     """
     key = keys.sim_alive(worker)
@@ -80,7 +80,7 @@ def claim_name(
         was_connected = was_connected or bool(connected)
         lost = was_connected and not connected
 
-        # A late answer does not free the name, nor does none from a network that was lost.
+        # The name is free only if there was no reply at all, neither late nor for lack of a connection.
         if not replies and not lost and now - last_change >= MEETING_SECONDS:
             return
         if taken and now - start >= patience_seconds:
@@ -96,14 +96,14 @@ def claim_name(
 
 
 class SimServer:
-    """The zenoh side of a worker: zenoh's threads only enqueue, the thread of `run` simulates and answers."""
+    """Zenoh server of a worker: zenoh's threads only enqueue, and the thread of `run` simulates and answers."""
 
     def __init__(self, session: zenoh.Session, worker: str, episodes: EpisodeRunner) -> None:
         self._session = session
         self._worker = worker
         self._episodes = episodes
         self._queue: queue.Queue[tuple[Callable[[zenoh.Query], None], zenoh.Query]] = queue.Queue(QUEUE_LENGTH)
-        # Watchers get what they can keep up with; the client's answer never waits for them.
+        # Frames are dropped for slow viewers, so that the client's answer never waits for them.
         drop = zenoh.CongestionControl.DROP
         self._frames = session.declare_publisher(
             keys.sim_frame(self._worker), encoding=encoding(sim_pb2.Frame), congestion_control=drop
@@ -120,12 +120,14 @@ class SimServer:
         ]
         token = self._session.liveliness().declare_token(keys.sim_alive(self._worker))
         log.info("worker %s is ready", self._worker)
+
         while not stop.is_set():
             try:
                 handle, query = self._queue.get(timeout=POLL_SECONDS)
             except queue.Empty:
                 continue
             self._answer(handle, query)
+
         token.undeclare()
         for queryable in queryables:
             queryable.undeclare()
@@ -152,7 +154,7 @@ class SimServer:
                 _reply_error(query, error)
             except Exception as error:
                 log.exception("a request on %s failed", query.key_expr)
-                # The physics may have advanced although its step never got an answer: nobody may build on it.
+                # The physics may have advanced without an answer to the step, so that the episode cannot go on.
                 self._episodes.abandon()
                 _reply_error(query, RequestError(types_pb2.ERROR_CODE_INTERNAL, "", "no fault", repr(error)))
 
@@ -187,7 +189,7 @@ def _reply_error(query: zenoh.Query, error: RequestError) -> None:
 
 
 def _refuse(query: zenoh.Query, code: types_pb2.ErrorCode, field: str, expected: str, got: str) -> None:
-    """Answers a query that nobody will work on."""
+    """Answers a query with an error."""
     with query:
         _reply_error(query, RequestError(code, field, expected, got))
 
@@ -198,7 +200,7 @@ def serve(config: ServeConfig) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
 
-    # A fault of the options is told before anything is loaded.
+    # Invalid options are reported before anything is loaded.
     zenoh_config(config.zenoh)
     with ExitStack() as network, ThreadPoolExecutor(1) as joining:
 
@@ -207,10 +209,10 @@ def serve(config: ServeConfig) -> None:
             claim_name(session, config.worker, stop)
             return session
 
-        # Side by side: the network is mostly waited for.
+        # Joining the network is mostly waiting, so the simulator loads meanwhile.
         joined = joining.submit(join)
         try:
-            episodes = _drawing_episodes(config.max_steps)
+            episodes = _load_episodes(config.max_steps)
             SimServer(joined.result(), config.worker, episodes).run(stop)
         except StoppedError as error:
             log.info("%s", error)
@@ -223,21 +225,21 @@ def serve(config: ServeConfig) -> None:
 
 
 def _exit(status: int) -> NoReturn:
-    """Not by way of the interpreter's end, which a thread still inside `zenoh.open` may abort."""
+    """Exits without the interpreter's shutdown, which a thread inside `zenoh.open` could abort."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
 
 
-def _drawing_episodes(max_steps: int) -> EpisodeRunner:
-    """A simulator that has drawn a frame: what keeps it from that comes up before anybody relies on the worker.
+def _load_episodes(max_steps: int) -> EpisodeRunner:
+    """Loads the simulator and draws a test frame, so that faults of rendering show before the worker is ready.
 
     Raises:
-        ConfigError: If a variable for OpenGL is at fault.
+        ConfigError: If an environment variable for OpenGL is invalid.
         OpenGLError: If OpenGL is missing or does not draw.
     """
     load_mujoco()
-    # Only here, since they import MuJoCo.
+    # Imported late, since they import MuJoCo.
     from cpn_sim_worker.episode import EpisodeRunner
     from cpn_sim_worker.render import Renderer
     from cpn_sim_worker.simulator import Simulator

@@ -1,4 +1,4 @@
-"""Zenoh sessions: joining a network, watching the connection to it, and asking services over it."""
+"""Zenoh sessions: configuration, opening, monitoring of the connection, and requests to services."""
 
 import ipaddress
 import json
@@ -31,34 +31,34 @@ Mode = Literal["peer", "client", "router"]
 
 
 def _default_hint(default: str) -> str:
-    """The end of an option's help, where tyro writes a list of one."""
+    """Default in an option's help, which tyro would write as a list of one."""
     return f"(default: {default.strip('[]').strip(chr(39))})"
 
 
-# Without constructors of their own, a namespace by the name of None would be none.
+# With constructors of their own, since tyro would parse a namespace called "None" as no namespace.
 Text = Annotated[str | None, tyro.conf.arg(constructor=str, help_behavior_hint=_default_hint)]
 File = Annotated[Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint=_default_hint)]
 
 MAX_MESSAGE_BYTES = 16 << 20
-"""Largest message that is put together from fragments. Zenoh's own bound is 1 GiB."""
+"""Largest message after defragmentation. Zenoh's default is 1 GiB."""
 REMINDER_SECONDS = 5.0
-"""Interval between two warnings that nobody is connected."""
+"""Interval of the warning that nothing is connected."""
 RETRY_SECONDS = 1.0
 """Longest pause between two tries to connect."""
-LOOK_SECONDS = 0.5
-"""Interval between two looks at the connection."""
+CHECK_SECONDS = 0.5
+"""Interval of checks of the connection."""
 POLL_SECONDS = 0.1
-"""How long a signal to stop may go unnoticed during the wait for a router."""
+"""Interval at which the signal to stop is checked during the wait for a router."""
 PROBE_SECONDS = 1.0
-"""Time that an endpoint has to answer each step of a probe."""
+"""Timeout of each step of an endpoint's probe."""
 
 
 class ConfigError(ValueError):
-    """An option or environment variable at fault."""
+    """Invalid option or environment variable."""
 
 
 class UnavailableError(Exception):
-    """No answer. Asking again later may help."""
+    """No answer; a later retry may succeed."""
 
 
 class NoRouterError(UnavailableError):
@@ -66,19 +66,19 @@ class NoRouterError(UnavailableError):
 
 
 class NotServedError(UnavailableError):
-    """The network is there, but nobody in it serves the key."""
+    """The network is connected, but no service has the key."""
 
 
 class LateError(UnavailableError):
-    """The answer did not come in time."""
+    """No answer came in time."""
 
 
 class StoppedError(Exception):
-    """The wait for a router was told to stop."""
+    """The wait for a router was cancelled."""
 
 
 def _from_environment(variable: str, read: Callable[[str], T], otherwise: T) -> Callable[[], T]:
-    """A default that is read from the environment, where an empty variable counts as unset."""
+    """Default factory that reads an environment variable; an empty one counts as unset."""
 
     def default() -> T:
         text = os.environ.get(variable)
@@ -136,11 +136,11 @@ class ZenohConfig:
         for name in ("connect", "listen"):
             endpoints = tuple(endpoint for value in getattr(self, name) for endpoint in _split(value))
             object.__setattr__(self, name, endpoints)
-        _go_together(self, "user", "password_file")
-        _go_together(self, "tls_ca", "tls_certificate", "tls_private_key")
+        _require_together(self, "user", "password_file")
+        _require_together(self, "tls_ca", "tls_certificate", "tls_private_key")
 
 
-def _go_together(config: ZenohConfig, *names: str) -> None:
+def _require_together(config: ZenohConfig, *names: str) -> None:
     missing = [name for name in names if getattr(config, name) is None]
     if 0 < len(missing) < len(names):
         given = " and ".join(_option(name) for name in names if name not in missing)
@@ -148,19 +148,20 @@ def _go_together(config: ZenohConfig, *names: str) -> None:
 
 
 def _option(name: str) -> str:
-    """An option as the command line and the environment have it."""
+    """Names of an option on the command line and in the environment."""
     variable = "ZENOH_CONFIG" if name == "zenoh_config" else f"CPN_{name.upper()}"
     return f"--{name.replace('_', '-')} ({variable})"
 
 
 def zenoh_config(options: ZenohConfig) -> zenoh.Config:
-    """The configuration of a session.
+    """Zenoh configuration of a session.
 
     Raises:
         ConfigError: If an option is malformed, a file cannot be used, an endpoint listens beyond the loopback interface
             without TLS, or a client has nothing to connect to.
     """
     config = _defaults() if options.zenoh_config is None else _own_config(options.zenoh_config)
+
     if options.mode is not None:
         _set(config, "mode", options.mode)
     for name in ("connect", "listen"):
@@ -174,6 +175,7 @@ def zenoh_config(options: ZenohConfig) -> zenoh.Config:
             raise ConfigError(f"{_option('password_file')}: expected a password, got an empty {options.password_file}")
         _set(config, "transport/auth/usrpwd/user", options.user, _option("user"))
         _set(config, "transport/auth/usrpwd/password", password)
+
     if options.tls_ca is not None and options.tls_certificate is not None and options.tls_private_key is not None:
         _set_tls(config, options.tls_ca, options.tls_certificate, options.tls_private_key)
     _check_endpoints(config, insecure=options.insecure)
@@ -181,7 +183,7 @@ def zenoh_config(options: ZenohConfig) -> zenoh.Config:
 
 
 def _defaults() -> zenoh.Config:
-    """Zenoh's defaults, without multicast, which fails without a word in containers, and with shorter pauses."""
+    """Zenoh's defaults with shorter pauses, and without multicast, which fails silently in containers."""
     config = zenoh.Config()
     _set(config, "scouting/multicast/enabled", value=False)
     _set(config, "scouting/gossip/enabled", value=True)
@@ -204,7 +206,7 @@ def _own_config(path: Path) -> zenoh.Config:
 def _set_tls(config: zenoh.Config, ca: Path, certificate: Path, private_key: Path) -> None:
     for name, path in (("tls_ca", ca), ("tls_certificate", certificate), ("tls_private_key", private_key)):
         _read(name, path)
-    # A file at fault would otherwise show as a router that never answers.
+    # Checked here, since zenoh reports a faulty file only as a router that does not answer.
     try:
         _tls_context(str(ca), str(certificate), str(private_key))
     except OSError as error:
@@ -224,8 +226,9 @@ def _set_tls(config: zenoh.Config, ca: Path, certificate: Path, private_key: Pat
     }
     for key, value in settings.items():
         _set(config, f"transport/link/tls/{key}", value)
-    # Zenoh's TLS links read and write the same stream from two threads at once, which corrupts memory sooner or later
-    # (eclipse-zenoh/zenoh#2557). Zenoh reads this when its first session is opened.
+
+    # A single thread, since zenoh's TLS links read and write one stream from two threads at once, which corrupts memory
+    # sooner or later (eclipse-zenoh/zenoh#2557). Zenoh reads this when its first session is opened.
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), tx: (handover: rx))")
 
 
@@ -242,7 +245,7 @@ def _check_endpoints(config: zenoh.Config, *, insecure: bool) -> None:
 
 
 def _is_private(endpoint: str) -> bool:
-    """Whether nobody on another machine can read or forge what passes through the endpoint."""
+    """Whether the endpoint is encrypted, or unreachable from other machines."""
     protocol, address = _parts(endpoint)
     if protocol in ("tls", "quic") or protocol.startswith("unix"):
         return True
@@ -286,7 +289,7 @@ def _mode_of(config: zenoh.Config) -> Mode:
 
 
 def _endpoints(config: zenoh.Config, direction: Literal["connect", "listen"]) -> list[str]:
-    """The endpoints of the session's mode. Zenoh holds one list for all modes or one for each, and groups in either."""
+    """Endpoints of the session's mode. Zenoh has one list for all modes or one for each, with optional groups."""
     value = _get(config, f"{direction}/endpoints")
     if isinstance(value, dict):
         value = value.get(_mode_of(config))
@@ -295,7 +298,7 @@ def _endpoints(config: zenoh.Config, direction: Literal["connect", "listen"]) ->
 
 
 def _text(error: zenoh.ZError) -> str:
-    """What zenoh says, without the places in its sources and in the value."""
+    """Message of a zenoh error, without positions in its sources and in the value."""
     text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error))
     message = re.search(r'msg: "(.*)", location', text)
     return message[1] if message else text
@@ -303,17 +306,17 @@ def _text(error: zenoh.ZError) -> str:
 
 @contextmanager
 def open_session(options: ZenohConfig, stop: threading.Event | None = None) -> Iterator[zenoh.Session]:
-    """A session that keeps trying to reach its endpoints, so that services may start in any order.
+    """Session that keeps trying to reach its endpoints, so that services may start in any order.
 
-    A client waits for its router, in the main thread interruptible by signals; a peer or router is there at once. While
-    none of the endpoints is connected, a warning every few seconds says so and why.
+    A client waits for its router, in the main thread interruptible by signals; a peer or router does not wait. While no
+    endpoint is connected, a warning every few seconds gives the reason.
 
     Args:
-        options: How to join the network.
-        stop: Ends a client's wait when it is set.
+        options: Settings of the session.
+        stop: Event that cancels a client's wait.
 
     Raises:
-        ConfigError: If an option is at fault.
+        ConfigError: If an option is invalid.
         StoppedError: If `stop` was set before a router answered.
         zenoh.ZError: If an endpoint cannot be listened on.
     """
@@ -329,16 +332,16 @@ def open_session(options: ZenohConfig, stop: threading.Event | None = None) -> I
 
 @contextmanager
 def look_in(options: ZenohConfig, patience_seconds: float) -> Iterator[zenoh.Session]:
-    """A session beside a service with the same options: it listens nowhere, and connects where the service does.
+    """Session beside a service with the same options: it connects to the same endpoints, and does not listen.
 
     Raises:
-        ConfigError: If an option is at fault.
+        ConfigError: If an option is invalid.
         NoRouterError: If a client reached no router in time.
     """
     config = zenoh_config(options)
     if _mode_of(config) == "router":
         _set(config, "mode", "client")
-    # A service that only listens is met at its own endpoint.
+    # A service that only listens is reached at its own endpoint.
     endpoints = _endpoints(config, "connect") or _endpoints(config, "listen")
     if all(_parts(endpoint)[1].endswith(":0") for endpoint in endpoints):
         raise ConfigError(f"{_option('connect')}: expected an endpoint of the network, got none")
@@ -361,7 +364,7 @@ def _open(
 
 
 class _Network:
-    """What a session connects to, and what keeps it from there: zenoh tells only that it reached none."""
+    """Endpoints of a session, with a diagnosis of failures: zenoh reports only that it reached none."""
 
     def __init__(self, config: zenoh.Config) -> None:
         self.endpoints = _endpoints(config, "connect")
@@ -372,7 +375,7 @@ class _Network:
         return ", ".join(self.endpoints) or "any address"
 
     def fault(self) -> str:
-        """Why none of the endpoints is connected, as far as it can be told."""
+        """Reasons why no endpoint is connected, by a probe of each."""
         return "; ".join(f"{endpoint}: {self._probe(endpoint)}" for endpoint in self.endpoints)
 
     def _probe(self, endpoint: str) -> str:
@@ -385,7 +388,7 @@ class _Network:
                 if protocol == "tls":
                     context = _tls_context(*self._tls)
                     with context.wrap_socket(connection, server_hostname=host) as encrypted, suppress(TimeoutError):
-                        # A server refuses a client's certificate after the handshake, and is silent if it takes it.
+                        # A server that refuses the client's certificate says so after the handshake, else it is silent.
                         encrypted.recv(1)
         except TimeoutError:
             return "no answer in time"
@@ -397,13 +400,13 @@ class _Network:
 def _tls_context(ca: str | None, certificate: str | None, private_key: str | None) -> ssl.SSLContext:
     context = ssl.create_default_context(cafile=ca)
     if certificate is not None:
-        # No password, rather than a question at the terminal.
+        # An empty password, since OpenSSL would prompt on the terminal.
         context.load_cert_chain(certificate, private_key, password="")
     return context
 
 
 class _Opening:
-    """Tries to reach a router, in a thread of its own, because `zenoh.open` keeps signals waiting."""
+    """Tries to reach a router, on a thread of its own, because `zenoh.open` blocks signals."""
 
     def __init__(self, config: zenoh.Config, network: _Network) -> None:
         self.fault = "no answer yet"
@@ -416,7 +419,7 @@ class _Opening:
         threading.Thread(target=self._run, name="zenoh-open", daemon=True).start()
 
     def _run(self) -> None:
-        # Zenoh's own patience, without end, would stay with the first endpoint; each of these tries goes through all.
+        # Each try goes through all endpoints; with a retry of its own, zenoh would stay with the first.
         last_probe = -REMINDER_SECONDS
         while not self._given_up.is_set():
             try:
@@ -435,7 +438,7 @@ class _Opening:
             session.close()
 
     def take(self) -> zenoh.Session | None:
-        """The session, if it is open by now; there will be none later."""
+        """Ends the tries; returns the session if it is open."""
         with self._lock:
             self._given_up.set()
             return self._session
@@ -467,7 +470,7 @@ def is_connected(session: zenoh.Session) -> bool:
 
 
 class _Watch:
-    """Warns while a session that has endpoints to connect to is connected to nobody."""
+    """Monitor that warns while a session with endpoints has no connection."""
 
     def __init__(self, session: zenoh.Session, network: _Network) -> None:
         self._session = session
@@ -479,7 +482,7 @@ class _Watch:
 
     def _run(self) -> None:
         reminded = None
-        while not self._closed.wait(LOOK_SECONDS):
+        while not self._closed.wait(CHECK_SECONDS):
             with self._lock:
                 if self._closed.is_set():
                     return
@@ -494,17 +497,17 @@ class _Watch:
                     log.warning("no router or peer is connected: %s; trying again", fault)
 
     def close(self) -> None:
-        """Ends the watch. A thread inside zenoh when the interpreter ends would abort the process, hence the lock."""
+        """Ends the monitor. The lock keeps its thread out of zenoh at the interpreter's shutdown, which would abort."""
         with self._lock:
             self._closed.set()
 
 
 def ask(session: zenoh.Session, key: str, request: Message, response_type: type[M], timeout_seconds: float) -> M:
-    """Queries the one service behind `key`.
+    """Sends a request to the service at `key`.
 
     Raises:
         NoRouterError: If no reply came, and no router or peer is connected.
-        NotServedError: If nobody serves the key.
+        NotServedError: If no service has the key.
         LateError: If no reply came in time.
         RequestError: If the service refused the request.
     """

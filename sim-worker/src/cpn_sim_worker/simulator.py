@@ -1,4 +1,4 @@
-"""The one simulator of a process: a scene at a time, and the renderer that shows it."""
+"""Simulator of a process: one scene at a time, and its renderer."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,18 @@ def _load(task: str) -> Scene:
 
 
 class Simulator:
-    """One scene at a time."""
+    """Simulator that hosts one scene at a time."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
         self._task: str | None = None
 
     def load(self, task: str) -> None:
-        """Hosts the scene of `task`, unless it does already.
+        """Loads the scene of `task`, unless it is loaded already.
 
         Raises:
-            UnknownTaskError: If there is no such task.
-            MissingExtraError: If it needs an extra that is not installed.
+            UnknownTaskError: If the task is unknown.
+            MissingExtraError: If the task needs an extra that is not installed.
         """
         if task != self._task:
             self.scene = _load(task)
@@ -37,12 +37,12 @@ class Simulator:
             self._task = task
 
     def reset(self, task: str, seed: int) -> NDArray[np.float64]:
-        """Starts the variation of `task` that `seed` draws; returns the state, [S].
+        """Starts the variation of `task` and `seed`; returns the state, [S].
 
         Raises:
-            UnknownTaskError: If there is no such task.
-            MissingExtraError: If it needs an extra that is not installed.
-            SeedError: If it has no such variation.
+            UnknownTaskError: If the task is unknown.
+            MissingExtraError: If the task needs an extra that is not installed.
+            SeedError: If the seed has no variation.
         """
         self.load(task)
         return self.scene.reset(seed)
@@ -52,5 +52,5 @@ class Simulator:
         return self.scene.step(action)
 
     def frame(self) -> NDArray[np.uint8]:
-        """The camera's image of the current state, [84, 84, 3], RGB, as `render_spec` tells."""
+        """Camera image of the current state, [84, 84, 3], RGB, rendered as in `render_spec`."""
         return self._renderer.render(self.scene)

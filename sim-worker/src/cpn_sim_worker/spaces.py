@@ -1,4 +1,4 @@
-"""Sizes of what a policy sees."""
+"""Sizes of observations."""
 
 IMAGE_SIZE = 84
 """Height and width of every image, in pixels."""

@@ -1,4 +1,4 @@
-"""The demonstration stream: sends an episode until the trainer has kept it."""
+"""Demonstration stream: sends an episode until the trainer has stored it."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -14,12 +14,12 @@ from cpn_sim_worker.wire import RequestError, decode, encoding
 
 COMMIT_TIMEOUT_SECONDS = 5.0
 TRAINER_PATIENCE_SECONDS = 120.0
-"""How long the trainer may be away, or miss steps, before a demonstration gives up."""
+"""Time after which sending fails if the trainer is unavailable or misses steps."""
 LOOKUP_TIMEOUT_SECONDS = 2.0
 
 
 class EpisodeLostError(Exception):
-    """The trainer kept missing steps however often they were sent."""
+    """The trainer still misses steps after all retries."""
 
 
 def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
@@ -27,7 +27,7 @@ def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
     hasher = hashlib.sha256()
     for step in steps:
         hasher.update(step.frame.data)
-        # Not every encoder sends a reward of -0, so a receiver may see 0.
+        # A reward of -0 counts as 0, since not every encoder sends the sign.
         for values in (step.action.values, step.state, [step.reward + 0.0]):
             hasher.update(np.array(values, "<f4").tobytes())
         hasher.update(bytes([step.success]))
@@ -35,10 +35,10 @@ def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
 
 
 def is_recorded(session: zenoh.Session, episode_id: str, render_spec: str) -> bool:
-    """Whether a recorder that is up holds the episode.
+    """Whether a running recorder has stored the episode.
 
     Raises:
-        RequestError: If it holds the episode in another rendering.
+        RequestError: If it has stored the episode with another render spec.
     """
     replies = session.get(keys.demonstration_recorded(episode_id), timeout=LOOKUP_TIMEOUT_SECONDS)
     recorded = [
@@ -58,14 +58,14 @@ def send_episode(
     steps: Sequence[demonstration_pb2.DemonstrationStep],
     episode: demonstration_pb2.RecordedEpisode,
 ) -> None:
-    """Sends the steps and commits them, again as long as the trainer misses some.
+    """Sends the steps and commits them, and again while the trainer misses some.
 
-    A trainer that is slow holds up the sender; one that is away is waited for.
+    A slow trainer slows down the sender; an unavailable one is waited for.
 
     Raises:
         EpisodeLostError: If steps stay missing.
         RequestError: If the trainer refuses the episode.
-        UnavailableError: If the trainer stays away.
+        UnavailableError: If the trainer stays unavailable.
     """
 
     def put(numbers: Iterable[int]) -> None:
@@ -74,13 +74,13 @@ def send_episode(
                 keys.demonstration_step(episode.episode_id, number),
                 steps[number].SerializeToString(),
                 encoding=encoding(demonstration_pb2.DemonstrationStep),
-                # A commit tells which steps are missing, and they are sent again: a router never has to wait for them.
+                # Dropped under congestion instead of blocking a router: the next commit lists the missing steps.
                 congestion_control=zenoh.CongestionControl.DROP,
             )
 
-    # The pauses grow, so that a trainer that is still busy with what was sent is not sent ever more.
+    # Exponential back-off, so that a busy trainer is not flooded with repeated steps.
     @retry(
-        retry=retry_if_exception(_may_pass),
+        retry=retry_if_exception(_is_transient),
         wait=wait_exponential(multiplier=0.1, max=5),
         stop=stop_after_delay(TRAINER_PATIENCE_SECONDS),
         reraise=True,
@@ -97,7 +97,7 @@ def send_episode(
     commit()
 
 
-def _may_pass(error: BaseException) -> bool:
+def _is_transient(error: BaseException) -> bool:
     if isinstance(error, RequestError):
         return error.code in (types_pb2.ERROR_CODE_UNAVAILABLE, types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED)
     return isinstance(error, UnavailableError | EpisodeLostError)

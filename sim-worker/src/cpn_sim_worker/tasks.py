@@ -1,4 +1,4 @@
-"""The tasks and the seeds that tell their variations apart."""
+"""Tasks, and the seeds of their variations."""
 
 # The paper shows its list of 24 tasks in a figure only; its text names door-lock, drawer-close, dial-turn and
 # coffee-button. The other twenty are our choice, by the rule in docs/decisions/0006-task-list.md.
@@ -31,12 +31,12 @@ TASKS = (
 
 JENGA_TASKS = ("jenga-poke", "jenga-poke-offset")
 
-# Demonstrations use the seeds below this one, evaluation uses it and those above: no variation is seen by both.
+# Demonstrations use the seeds below, evaluation this one and those above, so that no variation is used by both.
 FIRST_EVALUATION_SEED = 1_000_000
 
 
 class SeedError(ValueError):
-    """A seed that a task has no variation for."""
+    """Seed without a variation of the task."""
 
     def __init__(self, task: str, expected: str, got: int) -> None:
         super().__init__(f"seed of {task}: expected {expected}, got {got}")
@@ -45,7 +45,7 @@ class SeedError(ValueError):
 
 
 class MissingExtraError(Exception):
-    """A package is not installed that a task needs and an extra of this one brings."""
+    """A task needs a package of an extra that is not installed."""
 
     def __init__(self, extra: str, package: str) -> None:
         self.expected = f"cpn-sim-worker to be installed with its extra {extra}"
@@ -54,7 +54,7 @@ class MissingExtraError(Exception):
 
 
 class UnknownTaskError(ValueError):
-    """A task that is none of ours."""
+    """Unknown task."""
 
     def __init__(self, task: str) -> None:
         self.expected = f"one of {', '.join(TASKS + JENGA_TASKS)}"

@@ -1,4 +1,4 @@
-"""Conversions between NumPy and the messages of `cpn.v1`, and the error that a message at fault raises."""
+"""Conversions between NumPy arrays and the messages of `cpn.v1`, and the error of an invalid message."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PAYLOAD_BYTES = 1 << 20
-"""Far above every message of the project but a whole checkpoint, which no worker receives."""
+"""Largest message, far above all of the project except checkpoints, which no worker receives."""
 MAX_TEXT_BYTES = 500
-"""Longest `expected` and `got` of an error: a stranger's text may be in them."""
+"""Longest `expected` and `got` of an error, which may quote untrusted text."""
 
 M = TypeVar("M", bound=Message)
 
 
 class RequestError(Exception):
-    """Why a request was refused; travels as `cpn.v1.Error`."""
+    """Refusal of a request, encoded as `cpn.v1.Error`."""
 
     def __init__(self, code: types_pb2.ErrorCode, field: str, expected: object, got: object) -> None:
         name = types_pb2.ErrorCode.Name(code).removeprefix("ERROR_CODE_")
@@ -32,12 +32,12 @@ class RequestError(Exception):
         self.got = _cut(str(got))
 
     def to_proto(self) -> types_pb2.Error:
-        """The error as a message."""
+        """Encodes the error."""
         return types_pb2.Error(code=self.code, field=self.field, expected=self.expected, got=self.got)
 
     @classmethod
     def from_proto(cls, error: types_pb2.Error) -> RequestError:
-        """The error that a service answered with."""
+        """Decodes a service's error."""
         return cls(error.code, error.field, error.expected, error.got)
 
 
@@ -47,20 +47,20 @@ def _cut(text: str) -> str:
 
 
 def invalid(field: str, expected: object, got: object) -> RequestError:
-    """The error of a malformed field."""
+    """`INVALID_ARGUMENT` about a field."""
     return RequestError(types_pb2.ERROR_CODE_INVALID_ARGUMENT, field, expected, got)
 
 
 def encoding(message_type: type[Message]) -> str:
-    """The zenoh encoding of a message's bytes."""
+    """Zenoh encoding of a message type."""
     return f"application/protobuf;{message_type.DESCRIPTOR.full_name}"
 
 
 def decode(message_type: type[M], payload: bytes) -> M:
-    """A message from its bytes.
+    """Decodes a message.
 
     Raises:
-        RequestError: If there are too many bytes, or they are no such message.
+        RequestError: If the payload is larger than 1 MiB, or not such a message.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise invalid("payload", f"at most {MAX_PAYLOAD_BYTES} bytes", len(payload))
@@ -73,7 +73,7 @@ def decode(message_type: type[M], payload: bytes) -> M:
 
 
 def image_to_proto(pixels: NDArray[np.uint8], render_spec: str) -> types_pb2.Image:
-    """An image, [84, 84, 3], and how it was rendered, as a message."""
+    """Encodes an image, [84, 84, 3], with its render spec."""
     height, width, _ = pixels.shape
     return types_pb2.Image(
         height=height,
@@ -85,18 +85,18 @@ def image_to_proto(pixels: NDArray[np.uint8], render_spec: str) -> types_pb2.Ima
 
 
 def action_to_proto(action: NDArray[np.float32]) -> types_pb2.Action:
-    """An action, [A], as a message."""
+    """Encodes an action, [A]."""
     return types_pb2.Action(values=action.tolist())
 
 
 def action_from_proto(action: types_pb2.Action, size: int, field: str) -> NDArray[np.float32]:
-    """An action, [size] in [-1, 1], from its message; `field` names it in a `RequestError`."""
-    import numpy as np  # Half of what a health check costs, which needs no arrays.
+    """Decodes and validates an action, [size] in [-1, 1]; `field` names it in a `RequestError`."""
+    import numpy as np  # Imported late: it would double the time of a health check, which needs no arrays.
 
     if len(action.values) != size:
         raise invalid(f"{field}.values", f"{size} values", len(action.values))
     values = np.array(action.values, np.float32)
-    # Written so that NaN, which compares false with everything, is refused too.
+    # In this form NaN, which compares false with everything, is refused too.
     if not np.all(np.abs(values) <= 1):
         raise invalid(f"{field}.values", "finite values in [-1, 1]", values.tolist())
     return values

@@ -1,4 +1,4 @@
-//! Asks a service of gRPC for its health, as orchestrators want it: by the exit code.
+//! `cpn-health`: gRPC health check by exit code, for orchestrators.
 
 use anyhow::{Context, ensure};
 use clap::Parser;
@@ -48,6 +48,7 @@ async fn ask(args: Args) -> anyhow::Result<ServingStatus> {
     let Args { address, service, server_name, session, .. } = args;
     let host = address.rsplit_once(':').map_or(address.as_str(), |(host, _)| host);
     let name = ServerName::try_from(server_name.unwrap_or_else(|| host.to_owned()))?;
+
     let tls = match session.tls()? {
         Some(tls) => {
             let mut config = tls.client()?;
@@ -56,6 +57,7 @@ async fn ask(args: Args) -> anyhow::Result<ServingStatus> {
         }
         None => None,
     };
+
     let endpoint = Endpoint::from_shared(format!("http://{address}"))?;
     let connect = service_fn(move |_: Uri| {
         let (address, name, tls) = (address.clone(), name.clone(), tls.clone());
@@ -68,6 +70,7 @@ async fn ask(args: Args) -> anyhow::Result<ServingStatus> {
             std::io::Result::Ok(TokioIo::new(stream))
         }
     });
+
     let channel = endpoint.connect_with_connector(connect).await?;
     let answer = HealthClient::new(channel).check(HealthCheckRequest { service }).await?;
     Ok(answer.into_inner().status())

@@ -1,4 +1,4 @@
-//! A network with an authority and a router.
+//! Test network with an authority and a router.
 
 #![allow(dead_code, reason = "each test uses a part")]
 
@@ -21,7 +21,7 @@ pub struct Network {
 
 impl Network {
     pub async fn start() -> Self {
-        // As the programs do: zenoh's TLS links are safe on one thread only.
+        // As in the programs, since zenoh's TLS links are safe on one thread only.
         static RUNTIME: Once = Once::new();
         #[expect(unsafe_code, reason = "set before zenoh reads it, and once")]
         RUNTIME.call_once(|| unsafe {
@@ -34,7 +34,7 @@ impl Network {
         Self { folder, port, router }
     }
 
-    /// Starts the router anew, as after a change of its configuration.
+    /// Restarts the router with its current configuration.
     pub async fn restart(&mut self) {
         self.router.close().await.unwrap();
         self.router = open_router(self.folder.path(), self.port).await;

@@ -1,4 +1,4 @@
-//! Requests, answers and metadata, by the names that openpi's clients use.
+//! Requests, answers and metadata, with the field names of openpi's clients.
 
 use super::numpy::{self, Array, Fields, brief};
 use crate::core::PlannerCore;
@@ -16,11 +16,11 @@ const MODEL: &str = "model";
 const SEED: &str = "seed";
 const PROMPT: &str = "prompt";
 
-/// Every field that a request may have.
+/// Fields of a request.
 const FIELDS: [&str; 8] =
     [OBSERVATION_IMAGE, OBSERVATION_POSITION, GOAL_IMAGE, GOAL_POSITION, GOAL_ID, MODEL, SEED, PROMPT];
 
-/// A field's name and how its value is read.
+/// Name and parser of a field.
 type Reader<T> = (&'static str, fn(Value) -> Result<T, Error>);
 
 const OBSERVATION: [Reader<Observation>; 2] = [
@@ -33,7 +33,7 @@ const GOAL: [Reader<Goal>; 3] = [
     (GOAL_ID, |value| Ok(Goal::Id(text(value)?))),
 ];
 
-/// What a client is told when it connects: the models it can name, and the shape of the pictures they take.
+/// Metadata for a new client: the served models, and the shape of their images.
 pub(super) fn metadata(core: &PlannerCore) -> Vec<u8> {
     let model = |info: ModelInfo| {
         let tasks: Vec<_> = info.training_tasks.into_iter().map(Value::from).collect();
@@ -51,17 +51,18 @@ pub(super) fn metadata(core: &PlannerCore) -> Vec<u8> {
     numpy::write(&numpy::map([("models", models), ("image_shape", image_shape.into())]))
 }
 
-/// What a client asks for; `models` are those it can name.
+/// Decodes a plan request; `models` are the served models.
 ///
 /// # Errors
-/// `INVALID_ARGUMENT` with the field that is missing, unknown, twice there, or not what it should be.
+/// `INVALID_ARGUMENT` with the field that is missing, unknown, duplicate or invalid.
 pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> Result<PlanRequest, Error> {
     let mut fields = numpy::read(payload)?;
-    // What Python calls None is not there.
+    // A field that is None in Python counts as missing.
     fields.retain(|_, value| !value.is_nil());
     if let Some(name) = fields.keys().find(|name| !FIELDS.contains(&name.as_str())) {
         return Err(Error::invalid("payload", format!("fields among {}", FIELDS.join(", ")), name));
     }
+
     match fields.remove(PROMPT) {
         None => (),
         Some(prompt) if text(prompt.clone()).is_ok_and(|prompt| prompt.is_empty()) => (),
@@ -69,6 +70,7 @@ pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> R
             return Err(Error::invalid(PROMPT, "none: the goal is a picture or a position", brief(&prompt)));
         }
     }
+
     let observation = one_of("observation", OBSERVATION, &mut fields)?;
     let goal = one_of("goal", GOAL, &mut fields)?;
     let model = match fields.remove(MODEL) {
@@ -79,7 +81,7 @@ pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> R
     Ok(PlanRequest { seed, ..PlanRequest::new(model, goal, observation) })
 }
 
-/// The value of the one field among `readers` that is there.
+/// Value of the only given field among `readers`.
 fn one_of<T, const N: usize>(what: &str, readers: [Reader<T>; N], fields: &mut Fields) -> Result<T, Error> {
     let expected = format!("one of {}", readers.map(|(name, _)| name).join(", "));
     let mut given = readers.into_iter().filter_map(|(name, read)| Some((name, read, fields.remove(name)?)));
@@ -90,7 +92,7 @@ fn one_of<T, const N: usize>(what: &str, readers: [Reader<T>; N], fields: &mut F
     }
 }
 
-/// The name of the learned model, if there is no other that could be meant.
+/// Default model of a request: the only trained one.
 fn only_model(served: ListModelsResponse) -> Result<String, Error> {
     let mut names: Vec<_> = served.models.into_iter().map(|info| info.name).collect();
     names.retain(|name| name != RANDOM);
@@ -130,7 +132,7 @@ fn seed(value: Value) -> Result<u64, Error> {
     value.as_u64().ok_or_else(|| Error::invalid("", "an integer from 0 to 2^64 - 1", brief(&value)))
 }
 
-/// What a client gets: the actions to execute `[H, A]`, each value in [-1, 1], and where they come from.
+/// Encodes an answer: the actions to execute, `[H, A]`, clipped to [-1, 1], with their provenance and timings.
 pub(super) fn answer(plan: PlanResponse) -> Vec<u8> {
     let clipped = |action: Vec<f32>| action.into_iter().map(|value| value.clamp(-1.0, 1.0)).collect();
     let actions: Vec<_> = plan.actions.into_iter().map(clipped).collect();
@@ -152,7 +154,7 @@ pub(super) fn answer(plan: PlanResponse) -> Vec<u8> {
     ]))
 }
 
-/// An error of the planner about a field that its clients here know by another name.
+/// Translates the field name of a planner's error to that of openpi's clients.
 pub(super) fn renamed(mut error: Error) -> Error {
     let (field, rest) = error.field.split_once('.').unwrap_or((&error.field, ""));
     let name = match field {

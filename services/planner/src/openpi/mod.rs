@@ -1,7 +1,7 @@
-//! The planner for clients of openpi: its WebSocket protocol.
+//! WebSocket transport of the planner, with openpi's protocol.
 //!
-//! A client that connects is sent the metadata. It sends requests as binary frames of msgpack and gets an answer to each:
-//! a binary frame, or a text frame with an error, after which it can go on.
+//! The server sends its metadata to a new client. Requests are binary frames of msgpack; the answer to each is a binary frame,
+//! or a text frame with an error, after which the connection stays open.
 
 mod message;
 mod numpy;
@@ -32,41 +32,41 @@ use tracing::debug;
 use wire::Error;
 use wire::access::may_plan;
 
-/// Most clients at the same time; one more is refused.
+/// Maximum number of clients; further ones get HTTP 503.
 const MAX_CONNECTIONS: usize = 64;
-/// Most connections, with those that are only told so.
-pub(crate) const MAX_WAITING: usize = 2 * MAX_CONNECTIONS;
-/// Largest request.
+/// Maximum number of connections, including those that get HTTP 503.
+pub(crate) const MAX_SOCKETS: usize = 2 * MAX_CONNECTIONS;
+/// Largest request, in bytes.
 const MAX_BYTES: usize = 1 << 20;
-/// Longest head of a request for a connection.
+/// Longest HTTP head of the handshake, in bytes.
 const MAX_HEAD_BYTES: usize = 16 << 10;
-/// Path at which openpi's server says that it is well.
+/// Path of the health check, as of openpi's server.
 const HEALTH: &str = "/healthz";
-/// What a connection buffers, one way; a picture is 21 kB.
+/// Buffer size of a connection, per direction, in bytes; an image is 21 kB.
 const BUFFER_BYTES: usize = 32 << 10;
-/// How long a client may say nothing before it is asked for a sign of life, and then again before it is given up.
-const SILENCE: Duration = Duration::from_secs(20);
-/// How long a client may take to shake hands, or to take an answer.
-const PATIENCE: Duration = Duration::from_secs(5);
-/// How long a client may take to read why it is hung up on.
-const LINGER: Duration = Duration::from_secs(1);
+/// Silence of a client before a ping, and timeout of its answer.
+const PING_INTERVAL: Duration = Duration::from_secs(20);
+/// Timeout of the handshake, and of sending a message.
+const IO_TIMEOUT: Duration = Duration::from_secs(5);
+/// Timeout of a client's half of the closing handshake.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 type Socket = WebSocketStream<Connection>;
-/// With a text, if it is not the beginning of a WebSocket.
+/// HTTP response of the handshake; it has a body if the connection is not upgraded.
 type Answer = ErrorResponse;
 
-/// The planner's place among servers of openpi.
+/// Server of openpi's protocol.
 #[derive(Debug)]
 pub(crate) struct OpenpiServer {
-    /// Where it listens.
+    /// Listening address.
     pub(crate) address: SocketAddr,
-    /// Stops the tasks when it goes.
+    /// Guard that stops the tasks when dropped.
     stop: DropGuard,
     tasks: TaskTracker,
 }
 
 impl OpenpiServer {
-    /// Listens, and answers those who have `access`.
+    /// Starts the server, for clients that pass `access`.
     ///
     /// # Errors
     /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
@@ -78,7 +78,7 @@ impl OpenpiServer {
         Ok(Self { address, stop: stop.drop_guard(), tasks })
     }
 
-    /// Takes no more requests, answers those in flight, and closes every connection.
+    /// Stops accepting requests, answers those in flight, and closes all connections.
     pub(crate) async fn drain(self) {
         drop(self.stop);
         self.tasks.close();
@@ -95,7 +95,7 @@ async fn accept(
 ) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     while let Some(Some(stream)) = stop.run_until_cancelled(listener.next()).await {
-        // A client that comes when all places are taken is told so.
+        // Without a place, the client gets HTTP 503.
         let (core, stop, place) = (core.clone(), stop.clone(), Arc::clone(&places).try_acquire_owned().ok());
         let access = access.clone();
         tasks.spawn(async move {
@@ -115,14 +115,15 @@ async fn serve(
     place: Option<OwnedSemaphorePermit>,
     stop: &CancellationToken,
 ) -> Result<(), SocketError> {
-    let shaken = timeout(PATIENCE, shake_hands(stream, access, place.is_some())).await.map_err(too_slow)??;
+    let shaken = timeout(IO_TIMEOUT, handshake(stream, access, place.is_some())).await.map_err(timed_out)??;
     let Some(mut socket) = shaken else { return Ok(()) };
     send(&mut socket, Message::binary(message::metadata(core))).await?;
-    let mut asked = false;
-    while let Some(received) = stop.run_until_cancelled(timeout(SILENCE, socket.next())).await {
+
+    let mut pinged = false;
+    while let Some(received) = stop.run_until_cancelled(timeout(PING_INTERVAL, socket.next())).await {
         let silent = received.is_err();
         let answer = match received {
-            Err(silence) if asked => return Err(too_slow(silence)),
+            Err(silence) if pinged => return Err(timed_out(silence)),
             Err(_) => Some(Message::Ping(Bytes::new())),
             Ok(None) => return Ok(()),
             Ok(Some(Ok(Message::Binary(payload)))) => Some(answer(core, &payload).await),
@@ -131,28 +132,29 @@ async fn serve(
             }
             Ok(Some(Ok(_))) => None,
             Ok(Some(Err(SocketError::Capacity(CapacityError::MessageTooLong { size, .. })))) => {
-                send(&mut socket, refusal(&too_long(size))).await?;
-                return hang_up(socket, CloseCode::Size).await;
+                send(&mut socket, refusal(&message_too_long(size))).await?;
+                return close(socket, CloseCode::Size).await;
             }
             Ok(Some(Err(error))) => return Err(error),
         };
-        asked = silent;
+        pinged = silent;
         if let Some(answer) = answer {
             send(&mut socket, answer).await?;
         }
     }
-    hang_up(socket, CloseCode::Away).await
+    close(socket, CloseCode::Away).await
 }
 
-/// Upgrades a connection to a WebSocket. Who asks for health instead, as of openpi's server, is told of it, and who asks for anything
-/// else is refused; neither gets a socket.
-async fn shake_hands(mut stream: Connection, access: &Access, has_place: bool) -> Result<Option<Socket>, SocketError> {
+/// HTTP handshake, which upgrades the connection to a WebSocket. Health checks are answered, and other requests refused, both
+/// without a socket.
+async fn handshake(mut stream: Connection, access: &Access, has_place: bool) -> Result<Option<Socket>, SocketError> {
     let (request, rest) = read_request(&mut stream).await?;
     let answer = if request.uri().path() == HEALTH {
-        told(StatusCode::OK, "OK")
+        response_of(StatusCode::OK, "OK")
     } else {
         admit(&request, access, stream.peer(), has_place).unwrap_or_else(|refusal| refusal)
     };
+
     let mut bytes = Vec::new();
     write_response(&mut bytes, &answer)?;
     bytes.extend(answer.body().iter().flat_map(|text| text.bytes()));
@@ -170,7 +172,7 @@ async fn shake_hands(mut stream: Connection, access: &Access, has_place: bool) -
     Ok(Some(WebSocketStream::from_partially_read(stream, rest, Role::Server, Some(config)).await))
 }
 
-/// The head of a GET request, and what came with it.
+/// Reads the head of a GET request; returns it with the bytes after it.
 async fn read_request(stream: &mut Connection) -> Result<(Request, Vec<u8>), SocketError> {
     let mut head = Vec::new();
     loop {
@@ -183,24 +185,25 @@ async fn read_request(stream: &mut Connection) -> Result<(Request, Vec<u8>), Soc
     }
 }
 
-/// The answer to who asks for a WebSocket.
+/// HTTP response to a WebSocket request.
 #[expect(clippy::result_large_err, reason = "both are answers")]
 fn admit(request: &Request, access: &Access, peer: &Peer, has_place: bool) -> Result<Answer, Answer> {
-    let response = create_response(request).map_err(|error| told(StatusCode::BAD_REQUEST, &error.to_string()))?;
+    let response =
+        create_response(request).map_err(|error| response_of(StatusCode::BAD_REQUEST, &error.to_string()))?;
     let authorization = request.headers().get(AUTHORIZATION).and_then(|value| value.to_str().ok());
     if let Err(refusal) = access.check(peer, authorization, "openpi", may_plan) {
         let forbidden = refusal == Refusal::Forbidden;
         let status = if forbidden { StatusCode::FORBIDDEN } else { StatusCode::UNAUTHORIZED };
-        return Err(told(status, &refusal.to_string()));
+        return Err(response_of(status, &refusal.to_string()));
     }
     if !has_place {
         let reason = format!("connections: expected a free place, got {MAX_CONNECTIONS}");
-        return Err(told(StatusCode::SERVICE_UNAVAILABLE, &reason));
+        return Err(response_of(StatusCode::SERVICE_UNAVAILABLE, &reason));
     }
     Ok(response.map(|()| None))
 }
 
-fn told(status: StatusCode, text: &str) -> Answer {
+fn response_of(status: StatusCode, text: &str) -> Answer {
     let text = format!("{text}\n");
     let mut response = Answer::new(None);
     *response.status_mut() = status;
@@ -220,24 +223,24 @@ fn refusal(error: &Error) -> Message {
     Message::text(error.to_string())
 }
 
-fn too_long(bytes: usize) -> Error {
+fn message_too_long(bytes: usize) -> Error {
     Error::invalid("payload", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes"))
 }
 
 async fn send(socket: &mut Socket, message: Message) -> Result<(), SocketError> {
-    timeout(PATIENCE, socket.send(message)).await.map_err(too_slow)?
+    timeout(IO_TIMEOUT, socket.send(message)).await.map_err(timed_out)?
 }
 
-/// Says goodbye. What the client is sending still is read and forgotten: closed on it, it would not read why.
-async fn hang_up(mut socket: Socket, code: CloseCode) -> Result<(), SocketError> {
+/// Closes a connection. Data still arriving is read and discarded: on a reset, the client would not read the close frame.
+async fn close(mut socket: Socket, code: CloseCode) -> Result<(), SocketError> {
     send(&mut socket, Message::Close(Some(CloseFrame { code, reason: "".into() }))).await?;
     let stream = socket.get_mut();
     stream.shutdown().await?;
     let mut rest = stream.take(16 * MAX_BYTES as u64);
-    timeout(LINGER, tokio::io::copy(&mut rest, &mut tokio::io::sink())).await.map_err(too_slow)??;
+    timeout(CLOSE_TIMEOUT, tokio::io::copy(&mut rest, &mut tokio::io::sink())).await.map_err(timed_out)??;
     Ok(())
 }
 
-fn too_slow(silence: tokio::time::error::Elapsed) -> SocketError {
+fn timed_out(silence: tokio::time::error::Elapsed) -> SocketError {
     SocketError::Io(silence.into())
 }

@@ -1,23 +1,23 @@
-//! Numpy arrays in msgpack, as openpi's client packs and unpacks them.
+//! Numpy arrays in msgpack, in the encoding of openpi's client.
 
 use rmpv::Value;
 use std::collections::BTreeMap;
 use std::fmt;
 use wire::Error;
 
-/// How deep values may nest, as `rmpv` counts: a map is two, and a request has a list in a map in a map. The library's own
-/// limit is more than the stack of a thread holds.
+/// Maximum nesting depth, as `rmpv` counts: a map is two levels, and a request has a list in a map in a map. The library's
+/// default would overflow a thread's stack.
 const MAX_DEPTH: usize = 16;
 
-/// The fields of a message, by name.
+/// Fields of a message, by name.
 pub(super) type Fields = BTreeMap<String, Value>;
 
-/// A numpy array.
+/// Numpy array.
 pub(super) struct Array {
-    /// As numpy names it: byte order, kind, bytes of an element.
+    /// Numpy's dtype string: byte order, kind, bytes per element.
     pub(super) dtype: String,
     pub(super) shape: Vec<u32>,
-    /// The elements in C order.
+    /// Elements in C order.
     pub(super) data: Vec<u8>,
 }
 
@@ -31,7 +31,7 @@ impl fmt::Display for Array {
 impl TryFrom<Value> for Array {
     type Error = Error;
 
-    /// That the data fits the shape is for the reader to check.
+    /// Decodes an array; the caller checks that the data fits the shape.
     fn try_from(value: Value) -> Result<Self, Error> {
         let no_array = |got: &dyn fmt::Display| Error::invalid("", "a numpy array", got);
         let Value::Map(pairs) = value else { return Err(no_array(&brief(&value))) };
@@ -51,8 +51,8 @@ impl TryFrom<Value> for Array {
     }
 }
 
-/// A number or text for what numpy packs as a map: a scalar of its own types, or an array without dimensions. Anything else stays as
-/// it is.
+/// Unpacks a numpy scalar or a zero-dimensional array, which are encoded as maps, to a number or text. Other values are returned
+/// unchanged.
 pub(super) fn scalar(value: Value) -> Value {
     let Value::Map(pairs) = &value else { return value };
     let of_name = |name: &[u8]| pairs.iter().find(|(key, _)| key.as_slice() == Some(name)).map(|(_, value)| value);
@@ -67,7 +67,7 @@ pub(super) fn scalar(value: Value) -> Value {
     packed.unwrap_or(value)
 }
 
-/// The one element of an array without dimensions: an integer, bytes, or text of four bytes a letter.
+/// Element of a zero-dimensional array: an integer, bytes, or UTF-32 text.
 fn element(dtype: &str, data: &[u8]) -> Option<Value> {
     let wide = |fill: u8| {
         let mut bytes = [fill; 8];
@@ -92,7 +92,7 @@ fn element(dtype: &str, data: &[u8]) -> Option<Value> {
     }
 }
 
-/// What came, for an error: of what may be long, only how long it is.
+/// Short description of a value for an error: of containers and bytes only the length.
 pub(super) fn brief(value: &Value) -> String {
     match value {
         Value::Map(pairs) => format!("a map of {}", pairs.len()),
@@ -106,7 +106,7 @@ fn side(value: &Value) -> Option<u32> {
     value.as_u64()?.try_into().ok()
 }
 
-/// A float32 array `[rows, columns]`; all rows are of one length.
+/// Encodes a float32 array `[rows, columns]`; all rows have the same length.
 pub(super) fn matrix(rows: &[Vec<f32>]) -> Value {
     let shape = [rows.len(), rows.first().map_or(0, Vec::len)];
     let data: Vec<u8> = rows.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
@@ -119,22 +119,22 @@ pub(super) fn matrix(rows: &[Vec<f32>]) -> Value {
     Value::Map(pairs.map(|(key, value)| (key.into(), value)).into())
 }
 
-/// A map with names for keys.
+/// Map with string keys.
 pub(super) fn map<K: Into<Value>>(fields: impl IntoIterator<Item = (K, Value)>) -> Value {
     Value::Map(fields.into_iter().map(|(name, value)| (name.into(), value)).collect())
 }
 
-/// The bytes of a value.
+/// Encodes a value.
 pub(super) fn write(value: &Value) -> Vec<u8> {
     let mut bytes = Vec::new();
     rmpv::encode::write_value(&mut bytes, value).expect("a vector takes all bytes");
     bytes
 }
 
-/// The fields of a message.
+/// Decodes the fields of a message.
 ///
 /// # Errors
-/// If the bytes are not one map with names for keys.
+/// If the bytes are not a single map with string keys.
 pub(super) fn read(mut bytes: &[u8]) -> Result<Fields, Error> {
     let no_map = |got: &dyn fmt::Display| Error::invalid("payload", "one msgpack map with text for keys", got);
     let value = rmpv::decode::read_value_with_max_depth(&mut bytes, MAX_DEPTH).map_err(|e| no_map(&e))?;

@@ -1,4 +1,4 @@
-//! A planner on loopback and a client of each of its transports.
+//! Fixtures: a planner on loopback, and a client of each of its transports.
 
 #![allow(dead_code, reason = "each test file uses its part")]
 #![expect(clippy::unwrap_used, reason = "tests")]
@@ -28,12 +28,12 @@ use wire::{Code, Error, Message, key, proto, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
-/// What no test should ever reach.
+/// Timeout that no passing test reaches.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 /// Name of every planner here; their namespaces differ.
 pub const NAME: &str = "under-test";
 
-/// A running planner, with a second zenoh session and a gRPC channel to it.
+/// Running planner, with a second zenoh session and a gRPC channel to it.
 pub struct Fixture {
     pub planner: Planner,
     pub session: Session,
@@ -43,7 +43,7 @@ pub struct Fixture {
 }
 
 impl Fixture {
-    /// Serves `checkpoints`, by name, with `configure`'s changes to the settings.
+    /// Starts a planner with `checkpoints`, by name, and `configure`'s changes to the settings.
     pub async fn start(checkpoints: &[(&str, Vec<u8>)], configure: impl FnOnce(&mut Config)) -> Self {
         let models_dir = TempDir::new().unwrap();
         for (name, bytes) in checkpoints {
@@ -82,7 +82,7 @@ impl Fixture {
     }
 }
 
-/// A planner in a process of its own, which ends when this is dropped.
+/// Process of a planner, killed when dropped.
 pub struct Process(pub Child);
 
 impl Drop for Process {
@@ -92,7 +92,7 @@ impl Drop for Process {
     }
 }
 
-/// One way to reach a planner. Requests are protobuf, so that wrong ones can be sent.
+/// Client of one transport. Requests are protobuf messages, so that invalid ones can be sent.
 #[derive(Clone)]
 pub enum Client {
     InProcess(PlannerCore),
@@ -151,7 +151,7 @@ impl Client {
         }
     }
 
-    /// The digest that answers a plan by this model.
+    /// Digest of the checkpoint that answers a plan by this model.
     pub async fn digest(&self, model: &str) -> String {
         self.plan(plan_request(model, 1)).await.unwrap().model_digest
     }
@@ -161,7 +161,7 @@ fn encoded(request: &impl prost::Message) -> Option<Vec<u8>> {
     Some(request.encode_to_vec())
 }
 
-/// Sends any bytes as a query's payload, or none.
+/// Sends a query with any bytes as its payload, or without.
 pub async fn raw_query<R: Message>(
     session: &Session,
     key: &OwnedKeyExpr,
@@ -181,12 +181,12 @@ pub async fn raw_query<R: Message>(
     }
 }
 
-/// Fails instead of waiting for ever.
+/// Awaits with a timeout, so that a test fails instead of hanging.
 pub async fn soon<F: Future>(future: F) -> F::Output {
     tokio::time::timeout(PATIENCE, future).await.expect("nothing happened for a minute")
 }
 
-/// An image whose pixels follow from `seed`.
+/// Random image of a seed.
 pub fn image(seed: u64) -> proto::Image {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let data = (0..cpn::images::BYTES).map(|_| {
@@ -199,7 +199,7 @@ pub fn image(seed: u64) -> proto::Image {
     proto::Image { height: 84, width: 84, format, data: data.collect(), render_spec: String::new() }
 }
 
-/// A plan from the image `seed` to the image 0.
+/// Plan request from the image of `seed` to that of 0.
 pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
     proto::PlanRequest {
         model: model.into(),
@@ -210,7 +210,7 @@ pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
     }
 }
 
-/// The answer without the times, which no two requests share.
+/// Response without its times, for comparisons.
 pub fn timeless(response: PlanResponse) -> PlanResponse {
     PlanResponse { times: StageTimes::default(), ..response }
 }
@@ -226,12 +226,12 @@ pub fn from_file(model: &str, file: &str) -> proto::LoadModelRequest {
     proto::LoadModelRequest { model: model.into(), source: Some(proto::load_model_request::Source::File(file.into())) }
 }
 
-/// A checkpoint of few, random weights, trained on pictures of unknown origin.
+/// Checkpoint of a small, random model without a render spec.
 pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
     checkpoint_for(method, seed, "")
 }
 
-/// A checkpoint of few, random weights, trained on pictures that were rendered in one way.
+/// Checkpoint of a small, random model with a render spec.
 pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u8> {
     let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
@@ -253,7 +253,7 @@ pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u
     checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
 }
 
-/// A checkpoint of few, random weights that plans from position to position.
+/// Checkpoint of a small, random model of positions.
 pub fn position_checkpoint(seed: u64) -> Vec<u8> {
     let encoder = EncoderConfig::position([600, 0, 200], 100);
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, actions: 3, ..ModelConfig::paper(MethodKind::Cpn) };
@@ -267,7 +267,7 @@ pub fn position_checkpoint(seed: u64) -> Vec<u8> {
     checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
 }
 
-/// A plan from one position to another.
+/// Plan request from one position to another.
 pub fn position_request(model: &str) -> proto::PlanRequest {
     let (hand, goal) = (proto::Position { x: 0.5, y: 0.1, z: 0.2 }, proto::Position { x: 0.73, y: -0.09, z: 0.18 });
     proto::PlanRequest {
@@ -279,12 +279,12 @@ pub fn position_request(model: &str) -> proto::PlanRequest {
     }
 }
 
-/// A method of 4 actions a plan, by a function of a test.
+/// Method with the plans of a closure.
 pub fn method(plan: impl FnMut(&[Query<'_>]) -> Vec<Plan> + Send + 'static) -> Box<dyn Method> {
     Box::new(Stub(plan))
 }
 
-/// What [`Random`] plans.
+/// Plans of [`Random`].
 pub fn random(queries: &[Query<'_>]) -> Vec<Plan> {
     Random { actions: 4 }.plan(queries, &mut Search { solver: Solver::Gradient, iterations: Iterations::Fixed(0) })
 }
@@ -321,7 +321,7 @@ impl<F: FnMut(&[Query<'_>]) -> Vec<Plan> + Send> Method for Stub<F> {
     }
 }
 
-/// The test's side of a method that says which seed it plans for, and then waits to be let on.
+/// Control of a gated method, which reports the seed of a plan and then waits to be released.
 pub struct Gate {
     entered: mpsc::Receiver<u64>,
     gate: mpsc::Sender<()>,
@@ -343,7 +343,7 @@ impl Gate {
         Self { entered, gate }
     }
 
-    /// Waits until a plan is being made; answers its seed.
+    /// Waits until a plan has begun; returns its seed.
     pub async fn entered(&self) -> u64 {
         let arrival = async {
             loop {
@@ -356,13 +356,13 @@ impl Gate {
         soon(arrival).await
     }
 
-    /// Lets one plan on.
+    /// Releases one plan.
     pub fn open(&self) {
         self.gate.send(()).unwrap();
     }
 }
 
-/// A method that fails: on even seeds its actions are not numbers, on odd ones it panics.
+/// Faulty method: on even seeds its actions are NaN, on odd ones it panics.
 pub fn faulty() -> Box<dyn Method> {
     let plan = |query: &Query<'_>| {
         assert!(query.seed.is_multiple_of(2), "an odd seed");

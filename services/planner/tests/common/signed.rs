@@ -1,4 +1,4 @@
-//! Keys, and what they sign.
+//! Fixtures: keys and signature bundles.
 
 #![allow(dead_code, reason = "each test file uses its part")]
 
@@ -13,12 +13,12 @@ fn key(seed: u8) -> SigningKey {
     SigningKey::from_slice(&[seed; 32]).unwrap()
 }
 
-/// The public key of a seed, in PEM.
+/// Public key of a seed, in PEM.
 pub fn public_key(seed: u8) -> String {
     key(seed).verifying_key().to_public_key_pem(LineEnding::LF).unwrap()
 }
 
-/// A bundle for a file of these bytes, as the official tool makes it.
+/// Bundle for a file of these bytes, as the official tool writes it.
 pub fn bundle(seed: u8, bytes: &[u8]) -> String {
     let digest = signing::digest(bytes);
     let root = signing::digest(&hex::decode(&digest).unwrap());

@@ -1,6 +1,5 @@
-//! The versions of one model, in a folder of their own: the weights of each, named by their digest, and `history.json`,
-//! which says what they are. A version is there once the history says so: weights that it does not name are what a killed
-//! process, or a version that went, left behind.
+//! Version history of one model, in a folder with `history.json` and the weights of each version, named by their digest. A
+//! version exists once the history lists it; unlisted weights are left over from a killed process or a removed version.
 
 use anyhow::{Context, ensure};
 use serde::{Deserialize, Serialize};
@@ -12,26 +11,26 @@ use tracing::warn;
 use wire::checkpoint::{CheckpointAnnouncement, CheckpointManifest};
 use wire::{Code, Error};
 
-/// How the names of checkpoints end.
+/// File name extension of checkpoints.
 const EXTENSION: &str = "safetensors";
-/// Says what the versions of a model are.
+/// Name of the history file.
 const HISTORY: &str = "history.json";
 
-/// The versions of one model.
+/// Version history of one model.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct History {
-    /// Oldest first.
+    /// Manifests of the versions, oldest first.
     versions: Vec<CheckpointManifest>,
-    /// In the order in which they were promoted last; the last one is promoted.
+    /// Versions in the order of their latest promotions; the last one is promoted now.
     promotions: Vec<u32>,
-    /// When that was; greater at every promotion, whatever the clock says.
+    /// Time of the latest promotion, in nanoseconds since the Unix epoch; strictly increasing, even if the clock is set back.
     promoted_unix_nanos: u64,
 }
 
 impl History {
-    /// Reads a model's history, without the versions whose weights are gone or damaged, and removes what belongs to none;
-    /// none if no version is left.
+    /// Reads a model's history, without versions whose weights are missing or damaged, and removes files of no version; none if
+    /// no version is left.
     ///
     /// # Errors
     /// If the history cannot be read, is malformed, or is that of another model.
@@ -45,6 +44,7 @@ impl History {
         for CheckpointManifest { model, .. } in &history.versions {
             ensure!(model == expected, "model: expected {expected:?}, got {model:?}");
         }
+
         for manifest in std::mem::take(&mut history.versions) {
             let manifest = valid(manifest)?;
             let got = digest(&weights(folder, &manifest.digest))?;
@@ -61,6 +61,7 @@ impl History {
                 );
             }
         }
+
         let before = history.promotions.last().copied();
         history.forget_lost_promotions();
         let last = history.versions.last().map(|manifest| manifest.version);
@@ -68,26 +69,27 @@ impl History {
             Some(promoted) if before != Some(promoted) => history.promote(promoted),
             _ => {}
         }
-        history.sweep(folder);
+
+        history.remove_unused(folder);
         Ok((!history.versions.is_empty()).then_some(history))
     }
 
-    /// Writes the history; what it says holds from then on. Then removes what no version has any more.
+    /// Writes the history, atomically and durably; then removes weights of no version.
     ///
     /// # Errors
-    /// If it cannot be written.
+    /// If the history cannot be written.
     pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<()> {
         files::write_atomically(&folder.join(HISTORY), &serde_json::to_vec_pretty(self)?)?;
-        self.sweep(folder);
+        self.remove_unused(folder);
         Ok(())
     }
 
-    /// Of every version, oldest first.
+    /// Manifests of the versions, oldest first.
     pub(crate) fn manifests(&self) -> &[CheckpointManifest] {
         &self.versions
     }
 
-    /// The promoted version.
+    /// Promoted version.
     ///
     /// # Errors
     /// If there is none.
@@ -97,7 +99,7 @@ impl History {
         manifest.ok_or_else(|| Error::new(Code::Internal, "promotions", "a version", "none"))
     }
 
-    /// What planners are to be told.
+    /// Announcement of the promoted version.
     ///
     /// # Errors
     /// If no version is promoted.
@@ -106,7 +108,7 @@ impl History {
         Ok(CheckpointAnnouncement { manifest, promoted_unix_nanos: self.promoted_unix_nanos })
     }
 
-    /// Adds a version, promotes it, and forgets all but the last `keep`.
+    /// Adds and promotes a version, and removes all but the last `keep`.
     pub(crate) fn add(&mut self, manifest: CheckpointManifest, keep: usize) {
         self.promote(manifest.version);
         self.versions.push(manifest);
@@ -114,7 +116,7 @@ impl History {
         self.forget_lost_promotions();
     }
 
-    /// Keeps a signature with every version of these weights; false if they have it already.
+    /// Adds a signature to all versions with these weights; false if they have it already.
     pub(crate) fn sign(&mut self, digest: &str, bundle: &str) -> bool {
         let mut changed = false;
         for manifest in self.versions.iter_mut().filter(|manifest| manifest.digest == digest) {
@@ -126,14 +128,14 @@ impl History {
         changed
     }
 
-    /// Promotes the version that was promoted before the one that is; false if there is none.
+    /// Promotes the previously promoted version; false if there is none.
     pub(crate) fn roll_back(&mut self) -> bool {
         self.promotions.pop();
         let before = self.promotions.last().copied();
         before.map(|before| self.promote(before)).is_some()
     }
 
-    /// Promotes a version that is kept.
+    /// Promotes a version.
     pub(crate) fn promote(&mut self, version: u32) {
         self.promotions.retain(|promoted| *promoted != version);
         self.promotions.push(version);
@@ -147,9 +149,9 @@ impl History {
         self.promotions.retain(|promoted| versions.iter().any(|manifest| manifest.version == *promoted));
     }
 
-    /// Removes weights that no version has.
-    fn sweep(&self, folder: &Path) {
-        let sweep = || {
+    /// Removes weights of no version; an error is only logged.
+    fn remove_unused(&self, folder: &Path) {
+        let remove = || {
             for path in files::list(folder)? {
                 let digest = stem(&path);
                 if digest.is_some_and(|digest| self.versions.iter().all(|manifest| manifest.digest != digest)) {
@@ -158,28 +160,28 @@ impl History {
             }
             anyhow::Ok(())
         };
-        if let Err(error) = sweep() {
+        if let Err(error) = remove() {
             warn!(error = format!("{error:#}"), "old weights not removed");
         }
     }
 }
 
-/// `cpn` for `cpn.safetensors`; none for any other file.
+/// Model name of a checkpoint's file, for example `cpn` of `cpn.safetensors`; none for other files.
 pub(crate) fn stem(path: &Path) -> Option<String> {
     (path.extension()? == EXTENSION).then(|| path.file_stem()?.to_str().map(str::to_owned))?
 }
 
-/// Where the weights of a digest are.
+/// Path of the weights of a digest.
 pub(crate) fn weights(folder: &Path, digest: &str) -> PathBuf {
     folder.join(format!("{digest}.{EXTENSION}"))
 }
 
-/// Whether a checkpoint's file has a digest.
+/// Whether a checkpoint's file exists and has this digest.
 pub(crate) fn is_whole(path: &Path, expected: &str) -> bool {
     digest(path).is_ok_and(|got| got.as_deref() == Some(expected))
 }
 
-/// The digest of a checkpoint's file; none if there is no such file.
+/// Digest of a checkpoint's file; none if the file does not exist.
 fn digest(path: &Path) -> anyhow::Result<Option<String>> {
     match files::read_at_most(path, cpn::checkpoint::MAX_BYTES) {
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(None),
@@ -187,7 +189,7 @@ fn digest(path: &Path) -> anyhow::Result<Option<String>> {
     }
 }
 
-/// A manifest as it comes out of a message: the trip through the wire applies the same rules to it.
+/// Validates a manifest by encoding and decoding it, which applies the rules of messages.
 pub(crate) fn valid(manifest: CheckpointManifest) -> Result<CheckpointManifest, Error> {
     wire::decode(&wire::encode(manifest))
 }

@@ -1,6 +1,6 @@
-//! Publishing of checkpoints: numbered versions of every model, offered to planners over zenoh.
+//! Publishing of checkpoints: numbered versions of each model, offered to planners over zenoh.
 //!
-//! Versions are kept in a folder ([`versions`]) with a history of promotions, each with the signature beside its checkpoint.
+//! Versions are stored in a folder ([`versions`]) with a history of promotions, each with the signature beside its checkpoint.
 
 mod history;
 mod signature;

@@ -1,4 +1,4 @@
-//! Signatures beside checkpoints. They are passed on, not verified: which keys count is for planners to know.
+//! Signatures beside checkpoints, which are passed on unverified: the trusted keys are a setting of planners.
 
 use service_kit::files;
 use signing::Bundle;
@@ -6,7 +6,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use tracing::warn;
 
-/// Where the signature of a checkpoint's file lies.
+/// Path of the signature of a checkpoint's file.
 pub(crate) fn path(checkpoint: &Path) -> PathBuf {
     let mut path = checkpoint.as_os_str().to_owned();
     path.push(".");
@@ -14,8 +14,8 @@ pub(crate) fn path(checkpoint: &Path) -> PathBuf {
     path.into()
 }
 
-/// The bundle beside a checkpoint that claims to be of these bytes. Another one, that of the weights before for example, is
-/// passed over, with the reason in the log.
+/// Bundle beside a checkpoint, if it claims these bytes. Another one, for example of the previous weights, is ignored with a
+/// warning.
 pub(crate) fn beside(checkpoint: &Path, bytes: &[u8]) -> Option<String> {
     let path = path(checkpoint);
     let passed_over = |error: &dyn std::fmt::Display| {
@@ -23,7 +23,7 @@ pub(crate) fn beside(checkpoint: &Path, bytes: &[u8]) -> Option<String> {
         None
     };
 
-    // One byte more than a bundle may have, so that it is refused as too large.
+    // One byte beyond the limit, so that a larger bundle is refused as too large.
     let bundle = match files::read_at_most(&path, signing::MAX_BYTES + 1) {
         Ok(bundle) => bundle,
         Err(error) if error.kind() == ErrorKind::NotFound => return None,

@@ -1,7 +1,7 @@
-//! The published versions of every model, in the folder that training runs write their checkpoints to.
+//! Published versions of all models, in the folder that training runs write their checkpoints to.
 //!
-//! `<model>.safetensors` is what a run wrote last, `<model>.safetensors.sig` its signature, if it has one; `versions/<model>`
-//! is the model's history.
+//! `<model>.safetensors` is the latest checkpoint of a run, `<model>.safetensors.sig` its optional signature, and
+//! `versions/<model>` the model's history.
 
 use crate::publish::history::{self, History};
 use crate::publish::signature;
@@ -22,25 +22,25 @@ use wire::checkpoint::{
 };
 use wire::{Code, Error};
 
-/// Folder of the versions.
+/// Name of the folder of versions.
 const VERSIONS: &str = "versions";
 
-/// The versions that one process keeps. Every method may block.
+/// Published versions of all models, locked against other processes. All methods may block.
 #[derive(Debug)]
 pub struct Versions {
-    /// Where training runs write.
+    /// Folder that training runs write to.
     checkpoints: PathBuf,
     keep: usize,
-    /// Held as long as this lives.
+    /// Lock of the folder.
     _lock: File,
-    /// By model, each with a version at least. Held until a change is on disk.
+    /// Histories by model, each with at least one version. Locked until a change is durable.
     histories: Mutex<BTreeMap<String, History>>,
-    /// The checkpoints that were taken in or refused, each with its signature, by model.
+    /// Stamps of the latest checkpoint and signature published or refused, by model.
     seen: Mutex<HashMap<String, (Stamp, Option<Stamp>)>>,
     promoted: watch::Sender<BTreeMap<String, CheckpointAnnouncement>>,
 }
 
-/// Tells apart what a file was before and after it was written: its inode, and when that changed.
+/// Stamp that changes with every write to a file: inode, and change time in seconds and nanoseconds.
 type Stamp = (u64, i64, i64);
 
 fn stamp(metadata: &Metadata) -> Stamp {
@@ -48,10 +48,10 @@ fn stamp(metadata: &Metadata) -> Stamp {
 }
 
 impl Versions {
-    /// Takes over a folder, which is made if there is none; of each model at least the last `keep` versions will be kept.
+    /// Opens and locks a folder, created if there is none; of each model the last `keep` versions are kept.
     ///
     /// # Errors
-    /// If the folder cannot be made or read, another process has it, or a history in it is malformed.
+    /// If the folder cannot be created or read, another process has it, or a history in it is malformed.
     pub fn open(checkpoints: PathBuf, keep: NonZeroU16) -> anyhow::Result<Self> {
         let folder = checkpoints.join(VERSIONS);
         let lock = files::take_over(&folder)?;
@@ -63,33 +63,35 @@ impl Versions {
                 histories.insert(history.promoted()?.model.clone(), history);
             }
         }
+
         let promoted = histories.iter().map(|(model, history)| Ok((model.clone(), history.announcement()?)));
         let promoted = watch::Sender::new(promoted.collect::<Result<_, Error>>()?);
         let (histories, seen) = (Mutex::new(histories), Mutex::default());
         Ok(Self { checkpoints, keep: keep.get().into(), _lock: lock, histories, seen, promoted })
     }
 
-    /// What planners are to serve, by model.
+    /// Announcements of the promoted versions, by model.
     pub fn promoted(&self) -> watch::Receiver<BTreeMap<String, CheckpointAnnouncement>> {
         self.promoted.subscribe()
     }
 
-    /// Publishes every checkpoint that was written since the last time, and every signature: one that comes after its
-    /// checkpoint is added to the version. What is faulty is passed over, with its reason in the log, until it is written anew.
+    /// Publishes all checkpoints and signatures written since the last call; a signature that is later than its checkpoint is
+    /// added to the version. Faulty ones are ignored with a warning, until they are written anew.
     ///
     /// # Errors
     /// If the folder cannot be read.
     pub fn take_in(&self) -> anyhow::Result<()> {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         for path in files::list(&self.checkpoints)? {
-            // Before the file is read: if it is replaced in between, it is looked at once more.
+            // Taken before the file is read: a file that is replaced meanwhile gets a stale stamp, and is read again.
             let (Some(model), Ok(metadata)) = (history::stem(&path), path.metadata()) else { continue };
             let signed = signature::path(&path).metadata().ok();
             let stamps = (stamp(&metadata), signed.as_ref().map(stamp));
             if seen.get(&model) == Some(&stamps) {
                 continue;
             }
-            // One byte more than a checkpoint may have, so that it is refused as too large.
+
+            // One byte beyond the limit, so that a larger file is refused as too large.
             let bytes = files::read_at_most(&path, cpn::checkpoint::MAX_BYTES + 1)
                 .map_err(|e| Error::invalid("checkpoint", "a file that can be read", e));
             let published =
@@ -97,7 +99,7 @@ impl Versions {
             if let Err(error) = published {
                 warn!(path = %path.display(), %error, "checkpoint not published");
                 if error.code == Code::Internal {
-                    // It could not be kept; the next time it may.
+                    // It could not be written; the next call tries again.
                     continue;
                 }
             }
@@ -106,7 +108,7 @@ impl Versions {
         Ok(())
     }
 
-    /// Makes a checkpoint the next version of a model and promotes it, unless it is the last one already.
+    /// Publishes and promotes a checkpoint as the next version of a model, unless it is the latest version already.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for a faulty checkpoint or name, with the reason; `INTERNAL` if it cannot be written.
@@ -114,10 +116,11 @@ impl Versions {
         self.publish_signed(model, bytes, None)
     }
 
-    /// The same with a signature, which the last version gets too if it is this checkpoint already.
+    /// Publishes a checkpoint with a signature, which is added to the latest version if that is the same checkpoint.
     fn publish_signed(&self, model: &str, bytes: &[u8], signature: Option<String>) -> Result<(), Error> {
         let checkpoint = cpn::checkpoint::from_bytes(bytes)
             .map_err(|e| Error::invalid("checkpoint", "one that can be loaded", e))?;
+
         let mut histories = self.histories();
         let mut history = histories.get(model).cloned().unwrap_or_default();
         let last = history.manifests().last();
@@ -134,6 +137,7 @@ impl Versions {
             }
             return Ok(());
         }
+
         let manifest = history::valid(CheckpointManifest {
             model: model.to_owned(),
             version: last.map_or(1, |last| last.version + 1),
@@ -149,7 +153,7 @@ impl Versions {
         self.commit(&mut histories, model, history).map(drop)
     }
 
-    /// The versions of a model, or of all, whose weights are on disk.
+    /// Versions of a model, or of all models, whose weights are on disk.
     ///
     /// # Errors
     /// `NOT_FOUND` for an unknown model.
@@ -169,11 +173,11 @@ impl Versions {
         Ok(ListVersionsResponse { versions: versions.collect::<Result<_, Error>>()? })
     }
 
-    /// Lets planners serve a version that is kept.
+    /// Promotes a version, which planners then serve.
     ///
     /// # Errors
-    /// `NOT_FOUND` for an unknown model or version; `FAILED_PRECONDITION` if its weights are gone or damaged; `INTERNAL` if
-    /// it cannot be written.
+    /// `NOT_FOUND` for an unknown model or version; `FAILED_PRECONDITION` if its weights are missing or damaged; `INTERNAL` if
+    /// the history cannot be written.
     pub fn promote(&self, request: PromoteVersionRequest) -> Result<PromoteVersionResponse, Error> {
         let PromoteVersionRequest { model, version } = request;
         let mut histories = self.histories();
@@ -187,11 +191,11 @@ impl Versions {
         Ok(PromoteVersionResponse { manifest: self.commit(&mut histories, &model, history)? })
     }
 
-    /// Lets planners serve the version that was promoted before the one that is.
+    /// Promotes the previously promoted version.
     ///
     /// # Errors
-    /// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no other that is kept was promoted, or its weights are gone
-    /// or damaged; `INTERNAL` if it cannot be written.
+    /// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no other stored version was promoted before, or its weights are
+    /// missing or damaged; `INTERNAL` if the history cannot be written.
     pub fn roll_back(&self, RollBackRequest { model }: RollBackRequest) -> Result<RollBackResponse, Error> {
         let mut histories = self.histories();
         let mut history = find(&histories, &model)?.clone();
@@ -203,11 +207,11 @@ impl Versions {
         Ok(RollBackResponse { manifest: self.commit(&mut histories, &model, history)? })
     }
 
-    /// A piece of a version that is kept.
+    /// Byte range of a version's checkpoint.
     ///
     /// # Errors
-    /// `NOT_FOUND` for a digest that no version has; `INVALID_ARGUMENT` for an offset beyond its end; `INTERNAL` if it cannot
-    /// be read.
+    /// `NOT_FOUND` for a digest of no version; `INVALID_ARGUMENT` for an offset beyond the end; `INTERNAL` if the file cannot be
+    /// read.
     pub fn chunk(&self, request: CheckpointChunkRequest) -> Result<CheckpointChunkResponse, Error> {
         let CheckpointChunkRequest { digest, offset_bytes, length_bytes } = request;
         let histories = self.histories();
@@ -218,6 +222,7 @@ impl Versions {
         if offset_bytes >= *size_bytes {
             return Err(Error::invalid("offset_bytes", format!("less than {size_bytes}"), offset_bytes));
         }
+
         let mut data = vec![0; u64::from(length_bytes).min(size_bytes - offset_bytes) as usize];
         File::open(history::weights(&self.folder(model), &digest))
             .and_then(|file| file.read_exact_at(&mut data, offset_bytes))
@@ -225,7 +230,7 @@ impl Versions {
         Ok(CheckpointChunkResponse { data })
     }
 
-    /// Makes a promotion last, then lets it be known; answers what is promoted.
+    /// Stores a history with a new promotion, logs it, and returns the promoted manifest.
     fn commit(
         &self,
         histories: &mut BTreeMap<String, History>,
@@ -237,7 +242,7 @@ impl Versions {
         Ok(manifest)
     }
 
-    /// Makes a change last, then lets it be known; answers what is promoted.
+    /// Writes a changed history, then publishes its announcement; returns the promoted manifest.
     fn store(
         &self,
         histories: &mut BTreeMap<String, History>,
@@ -252,13 +257,13 @@ impl Versions {
         Ok(manifest)
     }
 
-    /// Whether a version's weights are on disk, by their size.
+    /// Whether a version's weights are on disk; only their size is compared.
     fn is_there(&self, CheckpointManifest { model, digest, size_bytes, .. }: &CheckpointManifest) -> bool {
         let weights = history::weights(&self.folder(model), digest);
         weights.metadata().is_ok_and(|metadata| metadata.len() == *size_bytes)
     }
 
-    /// Checks that the weights of what is to be promoted are on disk as they were: planners will ask for them.
+    /// Checks that the weights of a history's promoted version are intact, since planners will fetch them.
     fn check_whole(&self, history: &History) -> Result<(), Error> {
         let CheckpointManifest { model, version, digest, .. } = history.promoted()?;
         let weights = history::weights(&self.folder(model), digest);

@@ -1,5 +1,5 @@
-//! Publishing over zenoh: planners are told which version of each model to serve and fetch it piece by piece; people list,
-//! promote and roll back.
+//! Zenoh transport of publishing: announces promoted versions to planners, serves their checkpoints in chunks, and lists,
+//! promotes and rolls back versions.
 
 use crate::publish::versions::Versions;
 use crate::queries;
@@ -22,21 +22,21 @@ use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 
-/// How often the folder of checkpoints is looked at.
+/// Polling interval of the folder of checkpoints.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
-/// How long an answer may take.
+/// Timeout of an answer.
 const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Queryables and announcements of the versions; they stop when this is dropped.
+/// Queryables and announcements of the versions, which end when this is dropped.
 #[derive(Debug)]
 pub(crate) struct Publisher {
     _queryables: [Queryable<()>; 4],
-    /// They never end but with the reason why they cannot go on.
+    /// Tasks that end only with an error.
     pub(crate) tasks: JoinSet<anyhow::Result<()>>,
 }
 
-/// Announces the promoted version of every model to every planner, those to come included, and answers what is asked of
-/// the versions; when this returns, it does.
+/// Starts announcing the promoted version of each model to all planners, present and future, and serving the versions; when
+/// this returns, queries are answered.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
@@ -47,13 +47,14 @@ pub(crate) async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow
         serve(session, key::checkpoint_promote("*")?, Some("promote"), versions, Versions::promote).await?,
         serve(session, key::checkpoint_roll_back("*")?, Some("roll_back"), versions, Versions::roll_back).await?,
     ];
+
     let mut tasks = JoinSet::new();
     tasks.spawn(announce(session.clone(), Arc::clone(versions)));
     tasks.spawn(take_in(Arc::clone(versions)));
     Ok(Publisher { _queryables: queryables, tasks })
 }
 
-/// Answers a queryable's requests, which may be for a change.
+/// Declares a queryable, of a state `change` if there is one.
 async fn serve<Q, R>(
     session: &Session,
     key: OwnedKeyExpr,
@@ -76,7 +77,7 @@ where
     queries::serve(session, key, true, answer).await.map_err(|e| anyhow!(e))
 }
 
-/// Tells planners what is promoted, whenever that changes or one of them appears. They pass over what they know.
+/// Announces all promoted versions whenever one changes or a planner appears; planners ignore repeated announcements.
 async fn announce(session: Session, versions: Arc<Versions>) -> anyhow::Result<()> {
     let appeared = Arc::new(Notify::new());
     let notify = Arc::clone(&appeared);
@@ -104,7 +105,7 @@ async fn announce(session: Session, versions: Arc<Versions>) -> anyhow::Result<(
     }
 }
 
-/// Looks again and again for checkpoints that training runs have written.
+/// Polls for new checkpoints of training runs.
 async fn take_in(versions: Arc<Versions>) -> anyhow::Result<()> {
     let mut poll = tokio::time::interval(POLL_INTERVAL);
     loop {
@@ -116,7 +117,7 @@ async fn take_in(versions: Arc<Versions>) -> anyhow::Result<()> {
     }
 }
 
-/// The versions of a model, or of all, that a trainer keeps.
+/// Lists a trainer's versions of a model, or of all models.
 ///
 /// # Errors
 /// `NOT_FOUND` for an unknown model; `UNAVAILABLE` if there is no trainer.
@@ -126,7 +127,7 @@ pub async fn list(session: &Session, model: Option<String>) -> Result<Vec<Checkp
     Ok(response.versions)
 }
 
-/// Lets planners serve a version; answers what is promoted now.
+/// Promotes a version, and returns its manifest.
 ///
 /// # Errors
 /// `NOT_FOUND` for an unknown model or version; `UNAVAILABLE` if there is no trainer.
@@ -136,25 +137,26 @@ pub async fn promote(session: &Session, model: String, version: u32) -> Result<C
     Ok(response.manifest)
 }
 
-/// Lets planners serve the version that was promoted before; answers what is promoted now.
+/// Promotes the previously promoted version, and returns its manifest.
 ///
 /// # Errors
-/// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if none was; `UNAVAILABLE` if there is no trainer.
+/// `NOT_FOUND` for an unknown model; `FAILED_PRECONDITION` if no version was promoted before; `UNAVAILABLE` if there is no
+/// trainer.
 pub async fn roll_back(session: &Session, model: String) -> Result<CheckpointManifest, Error> {
     let key = key::checkpoint_roll_back(&model)?;
     let response: RollBackResponse = call(session, &key, RollBackRequest { model }).await?;
     Ok(response.manifest)
 }
 
-/// Asks a trainer, and for five seconds again if there is none: the session may have been opened just now. What may have
-/// reached one is not asked again, as rolling back twice is not rolling back once.
+/// Calls a trainer, with retries for five seconds while there is none, since the session may be new. A request that may have
+/// arrived is not repeated: rolling back is not idempotent.
 async fn call<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyExpr, request: Q) -> Result<R, Error> {
-    let patience = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(25);
+    let retries = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(25);
     let ask = || query::call(session, key, request.clone(), TIMEOUT);
-    ask.retry(patience).when(|error: &Error| error.code == Code::Unavailable).await
+    ask.retry(retries).when(|error: &Error| error.code == Code::Unavailable).await
 }
 
-/// Versions for a terminal, the promoted one marked, with the first digits of their digests.
+/// Table of versions for a terminal, with abbreviated digests.
 pub fn table(versions: &[CheckpointVersion]) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_HORIZONTAL_ONLY.row_separator(LineStyle::none()));

@@ -1,4 +1,4 @@
-//! A folder of recordings: `<task>/<episode id>.mcap`.
+//! Dataset folder: recordings as `<task>/<episode id>.mcap`.
 
 use anyhow::{Context, ensure};
 use rayon::prelude::*;
@@ -14,30 +14,30 @@ use tracing::warn;
 use wire::demonstration::RecordedEpisode;
 use wire::{Code, Error};
 
-/// The recordings that one process keeps. What is said of them holds of the files on disk: one that was removed, cut or
-/// replaced meanwhile is not taken for kept.
+/// Index of a dataset folder, locked against other processes. Lookups check the file on disk: an episode whose file was removed,
+/// truncated or replaced is not reported as stored.
 #[derive(Debug)]
 pub struct Recordings {
     folder: PathBuf,
-    /// Held as long as this lives.
+    /// Lock of the folder.
     _lock: File,
     index: Mutex<Index>,
-    /// Held from the check to the entry: two episodes of one id are never written both.
+    /// Held from the check to the entry in the index, so that two episodes of one id are never both written.
     writing: Mutex<()>,
 }
 
-/// The episodes that were whole when their files were read, by id.
+/// Episodes whose files were intact when read, by id.
 #[derive(Debug, Default)]
 struct Index(BTreeMap<String, Kept>);
 
-/// A file that was read to its end.
+/// Stored episode: the metadata of an intact file, and the file's stamp.
 #[derive(Debug, Clone)]
 struct Kept {
     info: RecordedEpisode,
     stamp: Stamp,
 }
 
-/// Tells apart what a file was before and after it was written: its inode, size, and when it changed.
+/// Stamp that changes with every write to a file: inode, size, and change time in seconds and nanoseconds.
 type Stamp = (u64, u64, i64, i64);
 
 fn stamp(path: &Path) -> std::io::Result<Stamp> {
@@ -46,9 +46,9 @@ fn stamp(path: &Path) -> std::io::Result<Stamp> {
 }
 
 impl Kept {
-    /// Reads a recording to its end.
+    /// Reads and validates a whole recording.
     fn read(folder: &Path, found: &Path) -> anyhow::Result<Self> {
-        // If the file is replaced while it is read, it is read once more.
+        // Taken before the read: a file that is replaced meanwhile gets a stale stamp, and is read again.
         let stamp = stamp(found)?;
         let info = read(folder, found)?.info().clone();
         Ok(Self { info, stamp })
@@ -56,18 +56,18 @@ impl Kept {
 }
 
 impl Index {
-    /// A kept episode; what is not on disk any more as it was read is read again, or forgotten.
+    /// Metadata of a stored episode; a changed file is read again, a missing or damaged one removed from the index.
     fn get(&mut self, folder: &Path, episode_id: &str) -> Option<&RecordedEpisode> {
         let Kept { info, stamp: known } = self.0.get(episode_id)?;
         let path = path(folder, info);
         if stamp(&path).ok() != Some(*known) {
-            self.take_in(folder, episode_id, &path);
+            self.refresh(folder, episode_id, &path);
         }
         self.0.get(episode_id).map(|kept| &kept.info)
     }
 
-    /// Looks at the place of an episode, whose file may have come, gone or changed.
-    fn take_in(&mut self, folder: &Path, episode_id: &str, path: &Path) {
+    /// Updates the entry of an episode from its file, which may be new, changed or missing.
+    fn refresh(&mut self, folder: &Path, episode_id: &str, path: &Path) {
         match Kept::read(folder, path) {
             Ok(kept) => drop(self.0.insert(episode_id.to_owned(), kept)),
             Err(error) => {
@@ -78,13 +78,13 @@ impl Index {
         }
     }
 
-    /// Every kept episode, by id.
+    /// Metadata of all stored episodes, ordered by id.
     fn all(&mut self, folder: &Path) -> Vec<RecordedEpisode> {
         let ids: Vec<_> = self.0.keys().cloned().collect();
         ids.iter().filter_map(|id| self.get(folder, id).cloned()).collect()
     }
 
-    /// Of every episode; none before the first.
+    /// Render spec of the dataset, the same for all episodes; none if there are none.
     fn render_spec(&mut self, folder: &Path) -> Option<String> {
         while let Some(id) = self.0.keys().next().cloned() {
             if let Some(info) = self.get(folder, &id) {
@@ -96,16 +96,17 @@ impl Index {
 }
 
 impl Recordings {
-    /// Takes over a folder: removes what a killed process left unfinished and reads every recording, on every core. A file
-    /// that is no whole recording is passed over; when its episode comes again, it takes the file's place.
+    /// Opens and locks a folder: removes temporary files of killed processes, and reads all recordings, on all cores. Damaged
+    /// files are skipped; their episodes, when sent again, replace them.
     ///
     /// # Errors
-    /// If the folder cannot be made or read, another process has it, or its recordings differ in their render spec.
+    /// If the folder cannot be created or read, another process has it, or its recordings differ in their render spec.
     pub fn open(folder: PathBuf) -> anyhow::Result<Self> {
         let lock = files::take_over(&folder)?;
         for task in tasks(&folder)? {
             files::remove_unfinished(&folder.join(task))?;
         }
+
         let paths = paths(&folder)?;
         let read: Vec<_> = paths.par_iter().map(|path| Kept::read(&folder, path)).collect();
         let mut index: BTreeMap<String, Kept> = BTreeMap::new();
@@ -117,6 +118,7 @@ impl Recordings {
                     continue;
                 }
             };
+
             let (info, path) = (&kept.info, path.display());
             if let Some(first) = index.values().next() {
                 let (expected, got) = (&first.info.render_spec, &info.render_spec);
@@ -134,39 +136,40 @@ impl Recordings {
         Ok(Self { folder, _lock: lock, index: Mutex::new(Index(index)), writing: Mutex::new(()) })
     }
 
-    /// Whether an episode was kept when it was last asked for; the disk is not looked at.
+    /// Whether an episode is in the index; its file is not checked.
     pub fn contains(&self, episode_id: &str) -> bool {
         self.index().0.contains_key(episode_id)
     }
 
-    /// What is known of a kept episode.
+    /// Metadata of a stored episode.
     pub fn get(&self, episode_id: &str) -> Option<RecordedEpisode> {
         self.index().get(&self.folder, episode_id).cloned()
     }
 
-    /// How many episodes are kept.
+    /// Number of stored episodes.
     pub fn count(&self) -> usize {
         self.all().len()
     }
 
-    /// Every kept episode, by id.
+    /// Metadata of all stored episodes, ordered by id.
     pub fn all(&self) -> Vec<RecordedEpisode> {
         self.index().all(&self.folder)
     }
 
-    /// Whether an episode is still to be kept; if not, the same one is kept already.
+    /// Whether an episode is missing; false if the same one is stored.
     ///
     /// # Errors
-    /// `FAILED_PRECONDITION` if another one is kept under its id, or it was rendered otherwise than those that are kept.
+    /// `FAILED_PRECONDITION` if a different episode is stored under its id, or its render spec is not that of the dataset.
     pub fn lacks(&self, offered: &RecordedEpisode) -> Result<bool, Error> {
         let mut index = self.index();
         let refused =
             |field, expected: &str, got: &str| Err(Error::new(Code::FailedPrecondition, field, expected, got));
+
         if !index.0.contains_key(&offered.episode_id) {
-            // Somebody may have put it there.
+            // The file may have been copied into the folder meanwhile.
             let path = path(&self.folder, offered);
             if path.exists() {
-                index.take_in(&self.folder, &offered.episode_id, &path);
+                index.refresh(&self.folder, &offered.episode_id, &path);
             }
         }
         if let Some(kept) = index.get(&self.folder, &offered.episode_id) {
@@ -175,6 +178,7 @@ impl Recordings {
                 None => Ok(false),
             };
         }
+
         match index.render_spec(&self.folder) {
             Some(expected) if expected != offered.render_spec => {
                 refused("render_spec", &expected, &offered.render_spec)
@@ -183,10 +187,10 @@ impl Recordings {
         }
     }
 
-    /// Keeps an episode, on disk when this returns, unless it is kept already.
+    /// Stores an episode, unless the same one is stored; it is durable when this returns.
     ///
     /// # Errors
-    /// Those of [`Self::lacks`]; `INTERNAL` if it cannot be written.
+    /// The errors of [`Self::lacks`]; `INTERNAL` if the file cannot be written.
     pub fn keep(&self, episode: &Episode) -> Result<(), Error> {
         let _writing = self.writing.lock().unwrap_or_else(PoisonError::into_inner);
         let info = episode.info();
@@ -204,15 +208,15 @@ impl Recordings {
         Ok(())
     }
 
-    /// Reads a kept episode; none if there is no such.
+    /// Reads a stored episode; none for an unknown id.
     ///
     /// # Errors
-    /// `INTERNAL` if its file is damaged; it is not taken for kept from then on.
+    /// `INTERNAL` if its file is damaged, which also removes it from the index.
     pub fn read(&self, episode_id: &str) -> Result<Option<Episode>, Error> {
         let Some(info) = self.get(episode_id) else { return Ok(None) };
         let path = path(&self.folder, &info);
         read(&self.folder, &path).map(Some).map_err(|e| {
-            self.index().take_in(&self.folder, episode_id, &path);
+            self.index().refresh(&self.folder, episode_id, &path);
             Error::new(Code::Internal, "episode_id", "a whole recording", format!("{e:#}"))
         })
     }
@@ -222,7 +226,7 @@ impl Recordings {
     }
 }
 
-/// What is known of an episode, by field.
+/// Metadata of an episode without its id, as names and texts of the fields.
 fn fields(episode: &RecordedEpisode) -> [(&'static str, String); 6] {
     let RecordedEpisode { episode_id: _, variation, steps, digest, goal_position, control_hz, render_spec } = episode;
     [
@@ -235,12 +239,13 @@ fn fields(episode: &RecordedEpisode) -> [(&'static str, String); 6] {
     ]
 }
 
-/// Where an episode is kept.
+/// Path of an episode's recording.
 fn path(folder: &Path, RecordedEpisode { episode_id, variation, .. }: &RecordedEpisode) -> PathBuf {
     folder.join(&variation.task).join(format!("{episode_id}.{}", recording::EXTENSION))
 }
 
-/// Checks that a recording lies where its header says: by its place it is told apart, held out, and found again.
+/// Checks that a recording's path agrees with its header: task and id are taken from the path when tasks are held out and
+/// episodes looked up.
 fn check_place(folder: &Path, found: &Path, info: RecordedEpisode) -> anyhow::Result<RecordedEpisode> {
     let expected = path(folder, &info);
     ensure!(found == expected, "place: expected {}, got {}", expected.display(), found.display());
@@ -250,7 +255,7 @@ fn check_place(folder: &Path, found: &Path, info: RecordedEpisode) -> anyhow::Re
 /// Reads a recording of a folder.
 ///
 /// # Errors
-/// If it is damaged, or does not lie where its header says.
+/// If the file is damaged, or its path does not agree with its header.
 pub fn read(folder: &Path, path: &Path) -> anyhow::Result<Episode> {
     let read = || {
         let episode = recording::read(path)?;
@@ -260,7 +265,7 @@ pub fn read(folder: &Path, path: &Path) -> anyhow::Result<Episode> {
     read().with_context(|| path.display().to_string())
 }
 
-/// The names of the tasks of a folder, in order.
+/// Names of the tasks of a folder, ordered.
 ///
 /// # Errors
 /// If the folder cannot be read.
@@ -269,7 +274,7 @@ pub fn tasks(folder: &Path) -> anyhow::Result<Vec<String>> {
     Ok(files::list(folder)?.iter().filter(|path| path.is_dir()).map(name).collect())
 }
 
-/// The recordings of a folder, in order of task and name.
+/// Paths of the recordings of a folder, ordered by task and name.
 ///
 /// # Errors
 /// If the folder cannot be read.
@@ -282,7 +287,7 @@ pub fn paths(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// The recordings whose names, which are their episodes' ids, are those of others before.
+/// Faults of recordings with the id, which is the file's name, of an earlier one.
 pub(crate) fn duplicates(paths: &[PathBuf]) -> Vec<String> {
     let mut seen = HashMap::new();
     let duplicate = |path: &PathBuf| {
@@ -293,8 +298,8 @@ pub(crate) fn duplicates(paths: &[PathBuf]) -> Vec<String> {
     paths.iter().filter_map(duplicate).collect()
 }
 
-/// The digest of a dataset: SHA-256, in hex, over what is known of each episode, its digest and render spec included, in the
-/// order of [`paths`]. How the files are compressed does not change it.
+/// Digest of a dataset: SHA-256, in hex, over the metadata of each episode, which has its digest and render spec, in the order
+/// of [`paths`]. It does not depend on the files' compression.
 pub fn dataset_digest<'a>(episodes: impl IntoIterator<Item = &'a RecordedEpisode>) -> String {
     let mut hasher = Sha256::new();
     for episode in episodes {

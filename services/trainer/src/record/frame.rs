@@ -1,13 +1,13 @@
-//! What a frame must be to be trained on.
+//! Requirements on frames of training data.
 
 use cpn::images;
 use wire::Error;
 use wire::demonstration::DemonstrationStep;
 
-/// Checks that a step's frame is of the one size that the method knows.
+/// Checks that a step's frame has the encoder's input size, 84 x 84 pixels.
 ///
 /// # Errors
-/// If it is not, naming the step.
+/// If it has another size; the error names the step.
 pub fn check(DemonstrationStep { step, frame, .. }: &DemonstrationStep) -> Result<(), Error> {
     let side = images::SIZE as u32;
     if (frame.height(), frame.width()) == (side, side) {

@@ -1,9 +1,8 @@
-//! Takes in demonstration streams.
+//! Ingest of demonstration streams.
 //!
-//! Steps are numbered and never acknowledged one by one: the sender commits an episode, and the answer tells which
-//! steps are still missing. An episode that is kept already answers that nothing is, so that a sender can always begin
-//! by committing, and a stream can be sent again without harm. What is lost on the way, or dropped because too many
-//! episodes are under way, is missing at the next commit, and so is never lost for good.
+//! Steps are numbered, and not acknowledged one by one: the sender commits an episode, and the answer lists the missing steps.
+//! For a stored episode the list is empty, so that a sender can begin with a commit, and sending again is idempotent. Steps that
+//! are lost in transit, or dropped because too many episodes are in progress, are listed by the next commit and sent again.
 
 use crate::record::folder::Recordings;
 use crate::record::frame;
@@ -15,12 +14,12 @@ use tracing::info;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpisode};
 use wire::{Code, Error};
 
-/// How much may be under way.
+/// Limits of episodes in progress.
 #[derive(Debug, Clone)]
 pub struct Limits {
-    /// Episodes at once; each may take as much memory as 1000 frames. A new one waits until another is kept.
+    /// Maximum number of episodes in progress, each of up to 1000 frames in memory. A new one waits until another is stored.
     pub episodes: usize,
-    /// An episode that nobody has sent a step of for so long is given up.
+    /// Time without a step after which an episode in progress may be dropped.
     pub silence: Duration,
 }
 
@@ -30,18 +29,18 @@ impl Default for Limits {
     }
 }
 
-/// What a commit led to.
+/// Outcome of a commit.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Commit {
-    /// These steps are to be sent again.
+    /// Steps to send again.
     Missing(Vec<u32>),
-    /// The episode is on disk since now.
+    /// Episode stored by this commit.
     Kept,
-    /// The episode was on disk before.
+    /// Episode stored before.
     KeptBefore,
 }
 
-/// Episodes under way, and those that are kept.
+/// Ingest of episodes, with those in progress.
 #[derive(Debug)]
 pub struct Ingest {
     recordings: Arc<Recordings>,
@@ -49,23 +48,23 @@ pub struct Ingest {
     open: Mutex<HashMap<String, Open>>,
 }
 
-/// An episode under way.
+/// Episode in progress.
 #[derive(Debug)]
 struct Open {
     steps: BTreeMap<u32, DemonstrationStep>,
-    /// Why it can no longer be kept; the next commit is told.
+    /// Error that the next commit is refused with.
     fault: Option<Error>,
-    heard: Instant,
+    last_step: Instant,
 }
 
 impl Ingest {
-    /// Keeps episodes among `recordings`.
+    /// Ingest into `recordings`.
     pub fn new(recordings: Arc<Recordings>, limits: Limits) -> Self {
         Self { recordings, limits, open: Mutex::default() }
     }
 
-    /// Takes in one step; a step that is there already is replaced. A frame of another size is not held, which bounds
-    /// what a stranger's stream can take.
+    /// Adds a step to its episode in progress; a later one of the same number replaces it. Frames of another size are dropped,
+    /// which bounds the memory of untrusted streams.
     pub fn step(&self, step: DemonstrationStep) {
         if self.recordings.contains(&step.episode_id) {
             return;
@@ -78,12 +77,12 @@ impl Ingest {
         }
     }
 
-    /// Keeps an episode if every step is there, else answers which are missing.
+    /// Stores an episode if all its steps have arrived, else returns the missing ones.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` if the steps do not make the episode, which is then forgotten; `FAILED_PRECONDITION` if another
-    /// one is kept under its id, or it was rendered otherwise than those that are kept; `RESOURCE_EXHAUSTED` if too many
-    /// are under way; `INTERNAL` if the file cannot be written.
+    /// `INVALID_ARGUMENT` if the steps are not a valid episode, which is then dropped; `FAILED_PRECONDITION` if a different
+    /// episode is stored under its id, or its render spec is not that of the dataset; `RESOURCE_EXHAUSTED` if too many episodes
+    /// are in progress; `INTERNAL` if the file cannot be written.
     pub fn commit(&self, request: &CommitEpisodeRequest) -> Result<Commit, Error> {
         let RecordedEpisode { episode_id, steps: count, .. } = &request.episode;
         let lacking = self.recordings.lacks(&request.episode);
@@ -91,6 +90,7 @@ impl Ingest {
             self.open().remove(episode_id);
             return lacking.map(|_| Commit::KeptBefore);
         }
+
         let steps = {
             let mut open = self.open();
             let episode = self.place(&mut open, episode_id).ok_or_else(|| self.full())?;
@@ -106,6 +106,7 @@ impl Ingest {
             open.remove(episode_id);
             steps
         };
+
         if let Some((&extra, _)) = steps.range(count..).next() {
             return Err(Error::invalid("steps", format!("all steps below {count}"), extra));
         }
@@ -116,18 +117,18 @@ impl Ingest {
         Ok(Commit::Kept)
     }
 
-    /// The place of an episode under way, which is heard of now; none if all places are taken.
+    /// Entry of an episode in progress, created if there is none; none if there are too many.
     fn place<'a>(&self, open: &'a mut HashMap<String, Open>, episode_id: &str) -> Option<&'a mut Open> {
         let now = Instant::now();
         if !open.contains_key(episode_id) && open.len() >= self.limits.episodes {
-            open.retain(|_, episode| now - episode.heard < self.limits.silence);
+            open.retain(|_, episode| now - episode.last_step < self.limits.silence);
             if open.len() >= self.limits.episodes {
                 return None;
             }
         }
-        let new = || Open { steps: BTreeMap::new(), fault: None, heard: now };
+        let new = || Open { steps: BTreeMap::new(), fault: None, last_step: now };
         let episode = open.entry(episode_id.to_owned()).or_insert_with(new);
-        episode.heard = now;
+        episode.last_step = now;
         Some(episode)
     }
 

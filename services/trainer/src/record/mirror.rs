@@ -1,7 +1,7 @@
-//! A late joiner: fetches what other recorders keep, then follows them, for good or until there is enough to train on.
+//! Mirror of other recorders: fetches their episodes, then follows their announcements, for ever or up to a number of episodes.
 
 use crate::record::folder::Recordings;
-use crate::record::send::{is_passing, patience};
+use crate::record::send::{is_transient, retry_policy};
 use backon::Retryable;
 use recording::Episode;
 use std::collections::BTreeMap;
@@ -14,19 +14,19 @@ use wire::{Code, Error, key, query};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
 
-/// Most episodes that a network may hold.
+/// Largest number of episodes in a network.
 const MAX_EPISODES: usize = 100_000;
-/// How long an answer may take: a list, or the steps of an episode.
+/// Timeout of an answer: a list, or the steps of an episode.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// How often everything is asked for anew, should an announcement be lost.
+/// Interval of full passes, which find episodes whose announcements were lost.
 const POLL_INTERVAL: Duration = Duration::from_secs(30);
-/// Announcements that may wait; of more, the oldest are lost.
+/// Capacity for announcements; the oldest are dropped.
 const ANNOUNCEMENTS: usize = 256;
 
-/// Fetches every episode that others keep and `recordings` lacks.
+/// Fetches all episodes of other recorders that `recordings` lacks.
 ///
 /// # Errors
-/// If nobody tells of any episode for two minutes, or one cannot be fetched, or differs from what is kept here.
+/// If no recorder offers an episode within two minutes, or an episode cannot be fetched, or differs from the one stored here.
 pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(), Error> {
     let attempt = || async {
         match pass(session, recordings).await?.offered {
@@ -34,10 +34,10 @@ pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(),
             _ => Ok(()),
         }
     };
-    attempt.retry(patience()).when(is_passing).await
+    attempt.retry(retry_policy()).when(is_transient).await
 }
 
-/// Does the same, and then fetches each episode as it is announced, until `enough` are kept.
+/// Fetches all episodes that `recordings` lacks, and then each announced one, until `enough` are stored.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
@@ -50,6 +50,7 @@ pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usi
             Ok(_) => {}
             Err(error) => warn!(%error, "not mirrored; tried again"),
         }
+
         let next_pass = Instant::now() + POLL_INTERVAL;
         while recordings.count() < enough
             && let Ok(announcement) = tokio::time::timeout_at(next_pass, announcements.recv_async()).await
@@ -64,12 +65,14 @@ pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usi
     Ok(())
 }
 
+/// Numbers of episodes offered and fetched in a full pass.
 struct Pass {
     offered: usize,
     fetched: usize,
 }
 
-/// Asks what is kept and fetches what is lacking; one episode that fails does not keep the others away.
+/// Full pass: lists the episodes of all recorders and fetches the missing ones. A failed episode does not stop the others; the
+/// last error is returned.
 async fn pass(session: &Session, recordings: &Arc<Recordings>) -> Result<Pass, Error> {
     let key = key::demonstration_recorded("*")?;
     let offered: Vec<RecordedEpisode> = query::collect(session, &key, MAX_EPISODES, TIMEOUT).await?;
@@ -84,7 +87,7 @@ async fn pass(session: &Session, recordings: &Arc<Recordings>) -> Result<Pass, E
     failed.map_or(Ok(pass), Err)
 }
 
-/// Fetches an episode that is offered, if it is lacking; answers whether it was.
+/// Fetches an offered episode if it is missing; returns whether it was.
 async fn take(session: &Session, recordings: &Arc<Recordings>, offered: RecordedEpisode) -> Result<bool, Error> {
     let id = offered.episode_id.clone();
     let lacking = recordings.lacks(&offered).map_err(|e| e.within(&id))?;
@@ -94,7 +97,7 @@ async fn take(session: &Session, recordings: &Arc<Recordings>, offered: Recorded
     Ok(lacking)
 }
 
-/// Fetches one episode; it is kept only if it has the digest that was announced.
+/// Fetches one episode, which is stored only if it has the announced digest.
 async fn fetch(session: &Session, recordings: &Arc<Recordings>, info: RecordedEpisode) -> Result<(), Error> {
     let key = key::demonstration_step(&info.episode_id, "*")?;
     let steps: Vec<DemonstrationStep> = query::collect(session, &key, 4 * MAX_STEPS as usize, TIMEOUT).await?;

@@ -1,8 +1,8 @@
 //! Recording of demonstration streams.
 //!
-//! Steps and commits come in over zenoh ([`start`]); episodes in progress are put together ([`ingest`]), checked step by step
-//! ([`frame`]) and kept in a folder ([`folder`]). Recordings can be sent to another trainer ([`send`]), copied from one
-//! ([`mirror`]) and checked ([`verify`]).
+//! Steps and commits arrive over zenoh ([`start`]); episodes in progress are assembled ([`ingest`]), checked step by step
+//! ([`frame`]) and stored in a folder ([`folder`]). Recordings can be sent to another trainer ([`send`]), copied from one
+//! ([`mirror`]) and verified ([`verify`]).
 
 pub mod folder;
 pub mod frame;

@@ -1,4 +1,4 @@
-//! Sends recordings: the steps that a worker sent, as far as a recorder lacks them.
+//! Sender of recordings, with the protocol of workers: only the steps that a recorder lacks are sent.
 
 use crate::record::folder;
 use anyhow::{Context, bail, ensure};
@@ -12,18 +12,19 @@ use wire::{Code, Error, encode, key, query};
 use zenoh::Session;
 use zenoh::qos::CongestionControl;
 
-/// How long one answer may take.
+/// Timeout of the answer to a commit.
 const COMMIT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Sends every recording of `folder`, or those of some tasks, until all are kept.
+/// Sends all recordings of `folder`, or those of some tasks, until a recorder has stored them.
 ///
 /// # Errors
-/// If a recording is damaged, two have one id, a task has none, a recorder refuses one, or none answers for two minutes.
+/// If a recording is damaged, two have the same id, a task is unknown, a recorder refuses one, or none answers for two minutes.
 pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::Result<()> {
     let all_tasks = folder::tasks(folder)?;
     for task in tasks {
         ensure!(all_tasks.contains(task), "tasks: expected some of {all_tasks:?}, got {task:?}");
     }
+
     let selected = |path: &Path| {
         tasks.is_empty()
             || path.parent().and_then(Path::file_name).is_some_and(|name| tasks.iter().any(|t| name == &**t))
@@ -32,6 +33,7 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
     if let Some(duplicate) = folder::duplicates(&paths).into_iter().next() {
         bail!(duplicate);
     }
+
     let mut sent = 0;
     for path in paths {
         let (place, reading) = (folder.to_owned(), path.clone());
@@ -43,10 +45,10 @@ pub async fn run(session: &Session, folder: &Path, tasks: &[String]) -> anyhow::
     Ok(())
 }
 
-/// Sends an episode until a recorder keeps it: begins with the commit, which tells which steps are missing.
+/// Sends an episode until a recorder has stored it: begins with a commit, whose answer lists the missing steps.
 ///
 /// # Errors
-/// If the recorder refuses the episode, or nobody takes it for two minutes.
+/// If a recorder refuses the episode, or none stores it within two minutes.
 pub async fn send(session: &Session, episode: &Episode) -> Result<(), Error> {
     let round = || async {
         let missing = commit(session, episode).await?;
@@ -55,7 +57,7 @@ pub async fn send(session: &Session, episode: &Episode) -> Result<(), Error> {
         }
         for step in episode.steps().iter().filter(|step| missing.contains(&step.step)) {
             let key = key::demonstration_step(&step.episode_id, &step.step.to_string())?;
-            // The commit tells which steps are missing, and they are sent again: a router never has to wait for them.
+            // Dropped under congestion instead of blocking a router: the next commit lists the missing steps.
             let put = session.put(key, encode(step.clone())).congestion_control(CongestionControl::Drop);
             put.await.map_err(|e| Error::new(Code::Unavailable, "transport", "a step sent", e))?;
         }
@@ -66,7 +68,7 @@ pub async fn send(session: &Session, episode: &Episode) -> Result<(), Error> {
             }
         }
     };
-    round.retry(patience()).when(is_passing).await
+    round.retry(retry_policy()).when(is_transient).await
 }
 
 async fn commit(session: &Session, episode: &Episode) -> Result<Vec<u32>, Error> {
@@ -76,13 +78,13 @@ async fn commit(session: &Session, episode: &Episode) -> Result<Vec<u32>, Error>
     Ok(response.missing_steps)
 }
 
-/// Whether an error may be gone the next time.
-pub(crate) fn is_passing(error: &Error) -> bool {
+/// Whether an error is transient.
+pub(crate) fn is_transient(error: &Error) -> bool {
     matches!(error.code, Code::Unavailable | Code::DeadlineExceeded | Code::ResourceExhausted)
 }
 
-/// When to try again: the recorder may be starting, or busy with the episodes of others.
-pub(crate) fn patience() -> ExponentialBuilder {
+/// Retry policy, for about two minutes: the recorder may be starting, or busy with other episodes.
+pub(crate) fn retry_policy() -> ExponentialBuilder {
     ExponentialBuilder::default()
         .with_min_delay(Duration::from_millis(20))
         .with_max_delay(Duration::from_secs(1))

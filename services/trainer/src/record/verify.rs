@@ -1,4 +1,4 @@
-//! Reads a whole dataset and says what is in it and what is wrong with it.
+//! Verification of a dataset: statistics and faults.
 
 use crate::record::folder::{self, dataset_digest};
 use anyhow::Context;
@@ -11,36 +11,36 @@ use std::fmt;
 use std::path::Path;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode};
 
-/// A hand that moves farther between two steps must change the picture: half of what one action moves it at most.
+/// Movement of the hand between two steps, in metres, above which the frame must change: half of the largest of one action.
 const VISIBLE_METRES: f32 = 0.005;
 
-/// What is in a dataset, and what is wrong with it.
+/// Report on a dataset.
 #[derive(Debug, Serialize)]
 pub struct Report {
-    /// One for each task, by name.
+    /// Statistics of each task, ordered by name.
     pub tasks: Vec<TaskReport>,
-    /// As a checkpoint that was trained on all of it names it.
+    /// SHA-256 of the dataset, in hex, as in the provenance of a checkpoint trained on all of it.
     pub digest: String,
-    /// Every fault, each with where it is.
+    /// All faults, each with its place.
     pub faults: Vec<String>,
 }
 
-/// The episodes of one task.
+/// Statistics of one task.
 #[derive(Debug, Serialize)]
 pub struct TaskReport {
     /// Name of the task.
     pub task: String,
-    /// Kept episodes.
+    /// Number of episodes.
     pub episodes: usize,
-    /// Seeds between the smallest and the largest kept one of which no episode is kept: the expert failed.
+    /// Number of seeds without an episode between the smallest and the largest one: the expert failed.
     pub rejected: u64,
-    /// Steps of an episode.
+    /// Mean number of steps of an episode.
     pub steps_mean: f64,
-    /// Size of a recording, in bytes.
+    /// Mean size of a recording, in bytes.
     pub bytes_mean: f64,
 }
 
-/// One recording, read and reduced to what the report needs.
+/// Summary of one recording.
 struct Facts {
     info: RecordedEpisode,
     bytes: u64,
@@ -48,11 +48,11 @@ struct Facts {
     faults: Vec<String>,
 }
 
-/// Reads every recording of `folder`, on every core, one at a time on each. Fewer than `tasks` tasks, or fewer than
-/// `episodes` of one, are a fault.
+/// Verifies all recordings of `folder`, on all cores, with one recording per core in memory. Fewer than `tasks` tasks, or fewer
+/// than `episodes` episodes of a task, are a fault.
 ///
 /// # Errors
-/// If the folder cannot be read; what is wrong inside it is in the report.
+/// If the folder cannot be read; faults inside it are in the report.
 pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Report> {
     let paths = folder::paths(folder)?;
     let read: Vec<_> = paths.par_iter().map(|path| facts(folder, path)).collect();
@@ -69,6 +69,7 @@ pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Repor
             Err(fault) => faults.push(format!("{fault:#} (remove the file and record it again)")),
         }
     }
+
     faults.extend(folder::duplicates(&paths));
     if by_task.len() < tasks {
         faults.push(format!("expected at least {tasks} tasks, got {}", by_task.len()));
@@ -81,6 +82,7 @@ pub fn run(folder: &Path, tasks: usize, episodes: usize) -> anyhow::Result<Repor
             faults.push(format!("{task}: expected actions that change, got constant ones in every episode"));
         }
     }
+
     let all = || by_task.values().flatten();
     faults.extend(mixed("render_spec", all().map(|facts| facts.info.render_spec.clone())));
     faults.extend(mixed("control_hz", all().map(|facts| facts.info.control_hz.to_string())));
@@ -103,7 +105,7 @@ fn facts(folder: &Path, path: &Path) -> anyhow::Result<Facts> {
     })
 }
 
-/// What is wrong inside an episode that is whole; that its actions lie in [-1, 1] is checked as it is read.
+/// Faults inside a valid episode; the range of its actions is checked when it is read.
 fn faults(episode: &Episode) -> Vec<String> {
     let steps = episode.steps();
     let mut faults = Vec::new();
@@ -124,13 +126,13 @@ fn faults(episode: &Episode) -> Vec<String> {
     faults
 }
 
-/// How far the hand moved; none if the state does not tell.
+/// Movement of the hand between two steps, in metres; none if the states have fewer than 3 values.
 fn hand_moved_metres(before: &DemonstrationStep, after: &DemonstrationStep) -> Option<f32> {
     let hands = before.state.get(..3)?.iter().zip(after.state.get(..3)?);
     Some(hands.map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt())
 }
 
-/// A fault if there are several values where there must be one.
+/// Fault of a field with several values in a dataset.
 fn mixed(field: &str, values: impl Iterator<Item = String>) -> Option<String> {
     let values: BTreeSet<String> = values.collect();
     (values.len() > 1).then(|| format!("{field}: expected one, got {}: {values:?}", values.len()))
@@ -138,7 +140,7 @@ fn mixed(field: &str, values: impl Iterator<Item = String>) -> Option<String> {
 
 fn summarise(task: &str, found: &[Facts]) -> TaskReport {
     let seeds: BTreeSet<u64> = found.iter().map(|facts| facts.info.variation.seed).collect();
-    // The sum of nothing is -0.
+    // An empty sum is -0.0 in Rust.
     let mean = |value: fn(&Facts) -> f64| (found.iter().map(value).sum::<f64>() + 0.0) / found.len().max(1) as f64;
     let tries = seeds.last().zip(seeds.first()).map_or(0, |(largest, smallest)| (largest - smallest).saturating_add(1));
     TaskReport {

@@ -1,4 +1,4 @@
-//! The recorder over zenoh: takes in streams, tells what it keeps, and sends it again to whoever asks.
+//! Zenoh transport of the recorder: receives streams, lists stored episodes, and serves their steps.
 
 use crate::queries::serve;
 use crate::record::folder::Recordings;
@@ -11,14 +11,14 @@ use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait};
 
-/// What makes a recorder; it stops when this is dropped.
+/// Subscriber and queryables of a recorder, undeclared when dropped.
 #[derive(Debug)]
 pub struct Recorder {
     _steps: Subscriber<()>,
     _queryables: [Queryable<()>; 3],
 }
 
-/// Starts to keep what is streamed, and to offer what is kept.
+/// Starts a recorder, which stores streamed episodes and offers stored ones.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
@@ -26,8 +26,9 @@ pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<I
     let (listed, read) = (Arc::clone(&recordings), recordings);
     let list = serve(session, key::demonstration_recorded("*")?, false, move |query| list(&listed, query)).await?;
     let send = serve(session, key::demonstration_step("*", "*")?, false, move |query| send(&read, query)).await?;
+
     let receiver = Arc::clone(&ingest);
-    // The callback only copies a frame. It must be done before the next message is read: a commit follows its steps.
+    // In the callback, which only copies a frame, so that steps are ingested before the commit that follows them.
     let steps = session
         .declare_subscriber(key::demonstration_step("*", "*")?)
         .callback(move |sample| match wire::decode(&sample.payload().to_bytes()) {
@@ -35,6 +36,7 @@ pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<I
             Err(error) => warn!(key = %sample.key_expr(), %error, "step refused"),
         })
         .await?;
+
     let announcer = session.clone();
     let commit =
         serve(session, key::demonstration_commit("*")?, false, move |query| commit(&announcer, &ingest, query)).await?;
@@ -59,7 +61,7 @@ fn commit(session: &Session, ingest: &Ingest, query: &Query) -> zenoh::Result<()
     query::reply(query, Ok(CommitEpisodeResponse { missing_steps }))
 }
 
-/// Tells of every kept episode that is asked for.
+/// Answers a query with the metadata of all matching stored episodes.
 fn list(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
     let asked = query.key_expr();
     let episodes = match key::episode_of_demonstration_recorded(asked).filter(|episode| !episode.contains('*')) {
@@ -75,7 +77,7 @@ fn list(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
     Ok(())
 }
 
-/// Sends the steps of one kept episode that are asked for, as they came.
+/// Answers a query with the matching steps of one stored episode.
 fn send(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
     let asked = query.key_expr();
     let Some(episode_id) = key::episode_of_demonstration_step(asked).filter(|episode| !episode.contains('*')) else {
@@ -85,7 +87,7 @@ fn send(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
         Ok(episode) => episode,
         Err(error) => return query::refuse(query, error),
     };
-    // What is not kept here may be elsewhere.
+    // An unknown episode gets no answer, since another recorder may have it.
     for step in episode.into_iter().flat_map(recording::Episode::into_steps) {
         let key = key::demonstration_step(&episode_id, &step.step.to_string())?;
         if asked.intersects(&key) {

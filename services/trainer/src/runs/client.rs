@@ -1,4 +1,4 @@
-//! The other side of the service's training runs: asking for them, and watching them on a terminal.
+//! Client of the service's training runs, with a progress bar for terminals.
 
 use crate::training::progress::{Bar, Observer};
 use anyhow::{Context, anyhow};
@@ -13,31 +13,31 @@ use zenoh::Session;
 use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
 
-/// How long an answer may take; a run that is stopped may take half a minute to end.
+/// Timeout of an answer; a run may take half a minute to stop.
 const TIMEOUT: Duration = Duration::from_secs(60);
-/// How long nothing may be heard of a run before it is asked for.
+/// Time without a publication after which a run's state is queried.
 const SILENCE: Duration = Duration::from_secs(5);
 
-/// Starts a run of the trainer of this name.
+/// Starts a run at the trainer of this name.
 ///
 /// # Errors
-/// Why there is none.
+/// If the trainer refuses the run, or does not answer.
 pub async fn start(session: &Session, trainer: &str, request: StartRunRequest) -> Result<Run, Error> {
     let answer: StartRunResponse = ask(session, &key::trainer_start_run(trainer)?, request).await?;
     Ok(answer.run)
 }
 
-/// Stops a run; answers how it ended.
+/// Stops a run, and returns its final state.
 ///
 /// # Errors
-/// Why it is not stopped.
+/// If the run is unknown or not running, or the trainer does not answer.
 pub async fn stop(session: &Session, trainer: &str, name: String) -> Result<Run, Error> {
     let request = StopRunRequest { name };
     let answer: StopRunResponse = ask(session, &key::trainer_stop_run(trainer)?, request).await?;
     Ok(answer.run)
 }
 
-/// Every run, by name.
+/// Lists all runs, ordered by name.
 ///
 /// # Errors
 /// If no trainer of this name answers.
@@ -46,14 +46,15 @@ pub async fn list(session: &Session, trainer: &str) -> Result<Vec<Run>, Error> {
     Ok(answer.runs)
 }
 
-/// Shows the progress of a run until it runs no more; answers how it ended.
+/// Shows the progress of a run until it ends, and returns its final state.
 ///
 /// # Errors
-/// If there is no such run, the trainer goes away, or what is published is not the run's progress.
+/// If the run is unknown, the trainer no longer answers, or a publication is malformed.
 pub async fn watch(session: &Session, trainer: &str, name: &str) -> anyhow::Result<Run> {
-    // What changes after the run was asked for is heard, as it is listened for already. Only the latest is of interest.
+    // Subscribed before the first query, so that no change in between is missed. Only the latest publication matters.
     let published = session.declare_subscriber(key::training_progress(name)?).with(RingChannel::new(1));
     let published = published.await.map_err(|e| anyhow!(e))?;
+
     let mut run = get(session, trainer, name).await?;
     let mut bar = Bar::new(name);
     bar.begin(run.progress.map_or(0, |progress| progress.step))?;
@@ -66,7 +67,7 @@ pub async fn watch(session: &Session, trainer: &str, name: &str) -> anyhow::Resu
         }
         run = match tokio::time::timeout(SILENCE, published.recv_async()).await {
             Ok(sample) => wire::decode(&sample.map_err(|e| anyhow!(e))?.payload().to_bytes())?,
-            // A step takes long, or the trainer has gone.
+            // The step is slow, or the trainer is gone.
             Err(_) => get(session, trainer, name).await?,
         };
     }
@@ -80,9 +81,9 @@ async fn get(session: &Session, trainer: &str, name: &str) -> anyhow::Result<Run
     Ok(runs.swap_remove(index))
 }
 
-/// Asks again if nobody serves the key: the trainer may not be found yet.
+/// Calls a trainer, with retries while it is unavailable: it may not be discovered yet.
 async fn ask<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyExpr, request: Q) -> Result<R, Error> {
-    let again = ConstantBuilder::default().with_delay(Duration::from_millis(500)).with_max_times(4);
+    let retries = ConstantBuilder::default().with_delay(Duration::from_millis(500)).with_max_times(4);
     let ask = || query::call(session, key, request.clone(), TIMEOUT);
-    ask.retry(again).when(|error: &Error| error.code == Code::Unavailable).await
+    ask.retry(retries).when(|error: &Error| error.code == Code::Unavailable).await
 }

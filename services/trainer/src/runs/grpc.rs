@@ -1,4 +1,4 @@
-//! Training runs over gRPC: translation.
+//! gRPC transport of training runs.
 
 use crate::runs::Runs;
 use crate::service::CHANGES;
@@ -20,7 +20,7 @@ use wire::training::{
 };
 use wire::{Code, Error, Message, proto};
 
-/// Listens and answers; healthy once it is told to be.
+/// Starts the gRPC server, whose health is `NOT_SERVING` until [`GrpcServer::ready`].
 ///
 /// # Errors
 /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
@@ -32,7 +32,7 @@ pub(crate) async fn start(runs: Runs, listen: ListenConfig, access: Access) -> a
     GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(routes)).await
 }
 
-/// The generated service, by the runs.
+/// Implementation of the generated service.
 struct Grpc(Runs);
 
 #[tonic::async_trait]

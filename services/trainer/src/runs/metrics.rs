@@ -1,10 +1,10 @@
-//! Training runs as metrics.
+//! Metrics of training runs.
 
 use crate::runs::Runs;
 use metrics::{counter, gauge};
 use wire::training::{Progress, Run, RunState};
 
-/// Keeps the metrics of every run up to date.
+/// Updates the metrics of all runs at every change.
 pub(crate) async fn follow(runs: Runs) {
     let mut changes = runs.changes();
     while let Some(changed) = changes.next().await {

@@ -1,6 +1,6 @@
-//! Training runs of the service: their registry, their processes, and the transports by which they are started and watched.
+//! Training runs of the service: their registry, their processes, and the transports that start and watch them.
 //!
-//! [`client`] is the other side.
+//! [`client`] is the client side.
 
 pub mod client;
 pub(crate) mod grpc;

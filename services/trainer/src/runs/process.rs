@@ -1,4 +1,4 @@
-//! The process of a training run: starting it, hearing of its progress, stopping it.
+//! Process of a training run: start, progress, stop.
 
 use crate::training::progress::Progress;
 use crate::training::run::Outcome;
@@ -16,27 +16,27 @@ use tokio_util::sync::CancellationToken;
 use tracing::warn;
 use wire::training::MAX_REASON_BYTES;
 
-/// How long a run may take to save its state.
+/// Grace period in which a stopped run saves its state.
 const GRACE: Duration = Duration::from_secs(30);
-/// Longest line that a run prints.
+/// Longest output line of a run, in bytes.
 const MAX_LINE_BYTES: usize = 4096;
-/// How the names of variables begin that would override a run's settings.
+/// Prefix of environment variables that would override a run's settings.
 const VARIABLES: &str = "CPN_TRAIN_";
 
-/// How a process ended.
+/// End of a process.
 #[derive(Debug)]
 pub(crate) enum End {
-    /// The checkpoint of this digest is written.
+    /// Finished; the checkpoint of this SHA-256 is written.
     Finished { digest: String },
-    /// Its state is saved.
+    /// Stopped with its state saved.
     Saved,
-    /// It was killed, for it did not save its state in time.
+    /// Killed, since it did not save its state in time.
     Killed,
-    /// By itself.
+    /// Failed by itself.
     Failed { reason: String },
 }
 
-/// What a run prints.
+/// Output line of a run.
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
 enum Line {
@@ -44,13 +44,14 @@ enum Line {
     Outcome(Outcome),
 }
 
-/// Runs `cpn-trainer train` with the settings of a file until it ends, or `stop` says so; what it logs is added to `log`.
+/// Runs `cpn-trainer train` with the settings of a file until it ends or `stop` is cancelled. Its log is appended to `log`;
+/// `on_progress` is called with each progress that it prints.
 pub(crate) async fn run(
     program: &Path,
     settings: &Path,
     log: &Path,
     stop: &CancellationToken,
-    hear: impl FnMut(Progress),
+    on_progress: impl FnMut(Progress),
 ) -> End {
     let run = async {
         let stderr = OpenOptions::new().create(true).append(true).open(log)?;
@@ -58,12 +59,13 @@ pub(crate) async fn run(
         for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with(VARIABLES)) {
             command.env_remove(name);
         }
-        // The end of its log is the reason if it fails: that of the error, not of a stack.
+        // The end of the log is reported as the reason of a failure, and should be the error, not a backtrace.
         command.env("RUST_LIB_BACKTRACE", "0");
         command.arg("train").arg("--json").arg("--config").arg(settings);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).kill_on_drop(true);
-        attend(command, stop, hear).await
+        supervise(command, stop, on_progress).await
     };
+
     match run.await {
         Ok((_, Some(Outcome::Finished { digest }), _)) => End::Finished { digest },
         Ok((status, Some(Outcome::Interrupted { .. }), _)) if status.success() => End::Saved,
@@ -73,11 +75,11 @@ pub(crate) async fn run(
     }
 }
 
-/// How the process ended, what it said of that, and whether it was killed.
-async fn attend(
+/// Supervises a process to its end; returns its exit status, the outcome that it printed, and whether it was killed.
+async fn supervise(
     mut command: Command,
     stop: &CancellationToken,
-    mut hear: impl FnMut(Progress),
+    mut on_progress: impl FnMut(Progress),
 ) -> std::io::Result<(ExitStatus, Option<Outcome>, bool)> {
     let mut child = command.spawn()?;
     let id = child.id().and_then(|id| Pid::from_raw(id.cast_signed()));
@@ -93,25 +95,27 @@ async fn attend(
                     too_long = true;
                     continue;
                 }
-                // After an error the stream pauses once.
+                // After an error, `FramedRead` returns none once before it continues.
                 None if std::mem::take(&mut too_long) => continue,
                 Some(Err(LinesCodecError::Io(_))) | None => break,
             };
             match serde_json::from_str(&line) {
-                Ok(Line::Progress(progress)) => hear(progress),
-                Ok(Line::Outcome(said)) => outcome = Some(said),
+                Ok(Line::Progress(progress)) => on_progress(progress),
+                Ok(Line::Outcome(printed)) => outcome = Some(printed),
                 Err(error) => warn!(line, %error, "line of a run passed over"),
             }
         }
         child.wait().await.map(|status| (status, outcome))
     };
     tokio::pin!(ended);
-    // As long as it has not been waited for, its id is not another's.
+
+    // The process id is not reused before the child is waited for.
     let send = |signal| {
         if let Some(Err(error)) = id.map(|id| kill_process(id, signal)) {
             warn!(%error, "signal not sent to a run");
         }
     };
+
     let mut killed = false;
     let ended = tokio::select! {
         ended = &mut ended => ended,
@@ -130,7 +134,7 @@ async fn attend(
     ended.map(|(status, outcome)| (status, outcome, killed))
 }
 
-/// Why a process failed: its status, and the end of its log.
+/// Reason of a failure: the exit status, and the end of the log.
 fn reason(status: ExitStatus, log: &Path) -> String {
     let tail = || {
         let mut file = std::fs::File::open(log)?;
@@ -152,7 +156,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     #[tokio::test]
-    async fn a_line_that_is_too_long_is_passed_over() -> anyhow::Result<()> {
+    async fn an_overlong_line_is_skipped() -> anyhow::Result<()> {
         let folder = tempfile::tempdir()?;
         let [program, log] = ["program", "log"].map(|name| folder.path().join(name));
         let script =

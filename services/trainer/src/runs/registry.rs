@@ -1,8 +1,7 @@
-//! Training runs without a transport: starting them as processes, stopping, listing and watching them.
+//! Registry of training runs, without transports: starts them as processes, stops, lists and watches them.
 //!
-//! A run has a folder, with its settings, its state, its log and its [`crate::training::journal`]. The state outlasts the service: a
-//! run that was under way when the service ended is interrupted, and goes on from where it saved its state when it is
-//! started again.
+//! A run has a folder with its settings, state, log and [`crate::training::journal`]. The state outlasts the service: a run in
+//! progress when the service ended is interrupted, and resumes from its last saved state when started again.
 
 use crate::runs::process::{self, End};
 use crate::training::{config, journal};
@@ -24,38 +23,38 @@ use wire::{Code, Error};
 const STATE: &str = "run.json";
 /// Name of the file with a run's settings.
 const SETTINGS: &str = "settings.toml";
-/// Name of the file with what a run logged.
+/// Name of the file with a run's log.
 const LOG: &str = "log.txt";
 
-/// Where runs are, and how many there may be.
+/// Folders and limits of training runs.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// Folder of the runs' folders.
+    /// Folder with a folder for each run.
     pub folder: PathBuf,
-    /// What they learn from.
+    /// Folder of the recorded demonstrations.
     pub dataset: PathBuf,
-    /// Where their checkpoints go.
+    /// Folder of the checkpoints.
     pub checkpoints: PathBuf,
-    /// Most that run at the same time.
+    /// Maximum number of concurrent runs.
     pub max_runs: usize,
-    /// `cpn-trainer`.
+    /// Path of `cpn-trainer`.
     pub program: PathBuf,
 }
 
-/// The runs of a service. Clones are the same runs.
+/// Registry of training runs. Clones share it.
 #[derive(Debug, Clone)]
 pub struct Runs {
     config: Arc<Config>,
-    /// Held until the shutdown: two services would each know a part of the runs.
+    /// Lock of the folder, held until shutdown: with two services, each would know only a part of the runs.
     lock: Arc<Mutex<Option<File>>>,
     runs: watch::Sender<BTreeMap<String, Run>>,
-    /// What stops each run that runs.
+    /// Stop tokens of the running runs, by name.
     stops: Arc<Mutex<HashMap<String, CancellationToken>>>,
     shutdown: CancellationToken,
     tasks: TaskTracker,
 }
 
-/// What outlasts the service.
+/// Persistent state of a run.
 #[derive(Debug, Serialize, Deserialize)]
 struct Kept {
     settings: toml::Table,
@@ -63,10 +62,10 @@ struct Kept {
 }
 
 impl Runs {
-    /// Reads which runs there are.
+    /// Opens and locks a folder, and reads the states of its runs.
     ///
     /// # Errors
-    /// If the folder cannot be made or read, or another process has it.
+    /// If the folder cannot be created or read, or another process has it.
     pub fn open(config: Config) -> anyhow::Result<Self> {
         let lock = files::take_over(&config.folder)?;
         let mut runs = BTreeMap::new();
@@ -87,20 +86,21 @@ impl Runs {
         })
     }
 
-    /// Starts a run, or takes up one that is there and neither runs nor is finished. Reads and writes files; wants tokio.
+    /// Starts a run, or resumes one that stopped, failed or was interrupted. Blocks on files; requires a tokio runtime.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` if the settings are wrong; `FAILED_PRECONDITION` if the run runs, is finished, or has other
-    /// settings; `RESOURCE_EXHAUSTED` if as many run as may, or there are too many; `UNAVAILABLE` during shutdown;
-    /// `INTERNAL` if a file cannot be written.
+    /// `INVALID_ARGUMENT` if the settings are invalid; `FAILED_PRECONDITION` if the run is running or finished, or has other
+    /// settings; `RESOURCE_EXHAUSTED` if the maximum number of concurrent runs, or of runs, is reached; `UNAVAILABLE` during
+    /// shutdown; `INTERNAL` if a file cannot be written.
     pub fn start(&self, request: &StartRunRequest) -> Result<Run, Error> {
         let name = &request.name;
         let folder = self.config.folder.join(name);
-        // Held to the end: a run is started once.
+        // Locked to the end, so that concurrent requests start a run once.
         let mut stops = self.stops();
         if self.shutdown.is_cancelled() {
             return Err(Error::new(Code::Unavailable, "service", "one that runs", "one that shuts down"));
         }
+
         self.forget_removed();
         let known = self.runs.borrow().get(name).cloned();
         if let Some(RunState::Running | RunState::Finished { .. }) = known.as_ref().map(|run| &run.state) {
@@ -128,21 +128,22 @@ impl Runs {
         let text = settings_of_process(&self.config, &run.name, &settings);
         let write = || {
             files::write_atomically(&folder.join(SETTINGS), text.to_string().as_bytes())?;
-            keep(&folder, &Kept { settings: settings.clone(), run: run.clone() })
+            save(&folder, &Kept { settings: settings.clone(), run: run.clone() })
         };
         write().map_err(|error| Error::new(Code::Internal, "name", "a folder to write to", format!("{error:#}")))?;
+
         self.runs.send_modify(|runs| drop(runs.insert(name.clone(), run.clone())));
         let stop = self.shutdown.child_token();
         stops.insert(name.clone(), stop.clone());
         info!(run = name, "started");
-        self.tasks.spawn(self.clone().attend(run.clone(), settings, stop));
+        self.tasks.spawn(self.clone().supervise(run.clone(), settings, stop));
         Ok(run)
     }
 
-    /// Lets a run save its state and end, or kills it after half a minute.
+    /// Stops a run, which saves its state, or is killed after half a minute.
     ///
     /// # Errors
-    /// `NOT_FOUND` if there is no such run; `FAILED_PRECONDITION` if it does not run.
+    /// `NOT_FOUND` for an unknown run; `FAILED_PRECONDITION` if it is not running.
     pub async fn stop(&self, name: &str) -> Result<Run, Error> {
         let mut runs = self.runs.subscribe();
         let state = self.get(name)?.state;
@@ -153,23 +154,23 @@ impl Runs {
                 return Err(Error::new(Code::FailedPrecondition, "name", "the name of a run that is running", got));
             }
         }
+
         let ended = |runs: &BTreeMap<String, Run>| runs.get(name).is_none_or(|run| run.state != RunState::Running);
-        // The sender lives as long as this.
+        // Cannot fail, as this has the sender.
         let _ = runs.wait_for(ended).await;
         self.get(name)
     }
 
-    /// Every run, by name; those whose folders were removed are not, unless they run.
+    /// All runs, ordered by name, without ended ones whose folders were removed.
     pub fn list(&self) -> Vec<Run> {
         self.forget_removed();
         self.runs.borrow().values().cloned().collect()
     }
 
-    /// How a run is, now and each time that has changed, until it runs no more; changes that come faster than they are
-    /// asked for are passed over.
+    /// Stream of a run's states: the current one, then each change until it ends. A slow consumer gets only the latest.
     ///
     /// # Errors
-    /// `NOT_FOUND` if there is no such run.
+    /// `NOT_FOUND` for an unknown run.
     pub fn watch(&self, name: &str) -> Result<impl Stream<Item = Run> + Send + use<>, Error> {
         self.get(name)?;
         let start = Some((self.runs.subscribe(), name.to_owned(), None));
@@ -181,14 +182,14 @@ impl Runs {
         }))
     }
 
-    /// Every run, then each that has changed.
+    /// Changes of all runs, beginning with their current states.
     pub(crate) fn changes(&self) -> Changes {
         let mut runs = self.runs.subscribe();
         runs.mark_changed();
         Changes { runs, seen: BTreeMap::new() }
     }
 
-    /// Stops every run, which can be taken up later, and starts no more.
+    /// Interrupts all runs, which can be resumed later, and refuses new ones.
     pub(crate) async fn shutdown(&self) {
         let running = {
             let _starting = self.stops();
@@ -203,7 +204,7 @@ impl Runs {
         drop(self.lock.lock().unwrap_or_else(PoisonError::into_inner).take());
     }
 
-    /// Forgets the runs whose folders somebody removed, so that they can be started anew.
+    /// Removes runs whose folders were deleted, so that they can be started anew.
     fn forget_removed(&self) {
         let is_there =
             |run: &Run| run.state == RunState::Running || self.config.folder.join(&run.name).join(STATE).exists();
@@ -219,7 +220,7 @@ impl Runs {
         self.runs.borrow().get(name).cloned().ok_or_else(unknown)
     }
 
-    /// The settings that a request asks for; those of the run that is there if it asks for none.
+    /// Settings of a request or, if it has none, those of the existing run.
     fn settings(&self, request: &StartRunRequest, folder: &Path) -> Result<toml::Table, Error> {
         let settings = requested_settings(&self.config, request)?;
         let kept = load(folder).map_err(|e| Error::new(Code::Internal, "name", "a run", format!("{e:#}")))?;
@@ -233,10 +234,10 @@ impl Runs {
         }
     }
 
-    /// Accompanies a run to its end.
-    async fn attend(self, mut run: Run, settings: toml::Table, stop: CancellationToken) {
+    /// Runs a run's process to its end, and updates its state.
+    async fn supervise(self, mut run: Run, settings: toml::Table, stop: CancellationToken) {
         let folder = self.config.folder.join(&run.name);
-        let hear = |progress| {
+        let on_progress = |progress| {
             self.runs.send_modify(|runs| {
                 if let Some(run) = runs.get_mut(&run.name) {
                     run.progress = Some(progress);
@@ -244,7 +245,8 @@ impl Runs {
             });
         };
         let (file, log) = (folder.join(SETTINGS), folder.join(LOG));
-        let end = process::run(&self.config.program, &file, &log, &stop, hear).await;
+        let end = process::run(&self.config.program, &file, &log, &stop, on_progress).await;
+
         run.progress = self.get(&run.name).ok().and_then(|run| run.progress);
         run.state = match end {
             End::Finished { digest } => RunState::Finished { digest },
@@ -255,12 +257,13 @@ impl Runs {
             End::Saved => RunState::Interrupted,
         };
         info!(run = run.name, state = run.state.name(), "ended");
+
         let kept = Kept { settings, run: run.clone() };
-        let written = tokio::task::spawn_blocking(move || keep(&folder, &kept)).await;
+        let written = tokio::task::spawn_blocking(move || save(&folder, &kept)).await;
         if let Err(error) = written.map_err(anyhow::Error::from).flatten() {
             warn!(error = format!("{error:#}"), "state of a run not written");
         }
-        // Its place is free by the time that anybody knows.
+        // The place is freed before the end is published, so that a client that sees it can start another run.
         self.stops().remove(&run.name);
         self.runs.send_modify(|runs| drop(runs.insert(run.name.clone(), run)));
     }
@@ -270,7 +273,7 @@ impl Runs {
     }
 }
 
-/// What has changed since it was asked for last.
+/// Stream of changed runs.
 #[derive(Debug)]
 pub(crate) struct Changes {
     runs: watch::Receiver<BTreeMap<String, Run>>,
@@ -278,17 +281,17 @@ pub(crate) struct Changes {
 }
 
 impl Changes {
-    /// Waits for a change; none once the runs are no more.
+    /// Waits for a change, and returns all changed runs; none once the registry is dropped.
     pub(crate) async fn next(&mut self) -> Option<Vec<Run>> {
         self.runs.changed().await.ok()?;
         let runs = self.runs.borrow_and_update().clone();
-        let news = runs.values().filter(|run| self.seen.get(&run.name) != Some(run)).cloned().collect();
+        let changed = runs.values().filter(|run| self.seen.get(&run.name) != Some(run)).cloned().collect();
         self.seen = runs;
-        Some(news)
+        Some(changed)
     }
 }
 
-/// What is kept in a run's folder; none if it is no run's.
+/// Reads the state in a run's folder; none if the folder is not one of a run.
 fn load(folder: &Path) -> anyhow::Result<Option<Kept>> {
     let bytes = match std::fs::read(folder.join(STATE)) {
         Err(error) if [std::io::ErrorKind::NotFound, std::io::ErrorKind::NotADirectory].contains(&error.kind()) => {
@@ -304,11 +307,11 @@ fn load(folder: &Path) -> anyhow::Result<Option<Kept>> {
     Ok(Some(kept))
 }
 
-fn keep(folder: &Path, kept: &Kept) -> anyhow::Result<()> {
+fn save(folder: &Path, kept: &Kept) -> anyhow::Result<()> {
     files::write_atomically(&folder.join(STATE), &serde_json::to_vec_pretty(kept)?)
 }
 
-/// The settings in a request, tried.
+/// Validated settings of a request.
 fn requested_settings(config: &Config, request: &StartRunRequest) -> Result<toml::Table, Error> {
     let StartRunRequest { name, preset, hold_out, seed, settings } = request;
     let mut table: toml::Table =
@@ -318,6 +321,7 @@ fn requested_settings(config: &Config, request: &StartRunRequest) -> Result<toml
             return Err(Error::invalid(format!("settings.{field}"), "none: the service sets it", value));
         }
     }
+
     let hold_out = (!hold_out.is_empty()).then(|| hold_out.clone().into());
     let seed =
         seed.map(i64::try_from).transpose().map_err(|_| Error::invalid("seed", "less than 2^63", seed.unwrap_or(0)))?;
@@ -330,12 +334,13 @@ fn requested_settings(config: &Config, request: &StartRunRequest) -> Result<toml
             return Err(Error::invalid(format!("settings.{field}"), "a setting that is named once", twice));
         }
     }
+
     config::Config::from_toml(&settings_of_process(config, name, &table).to_string())
         .map_err(|error| Error::invalid("settings", "settings of a training run", format!("{error:#}")))?;
     Ok(table)
 }
 
-/// What the service decides of a run's settings.
+/// Settings that the service decides for a run.
 fn process_settings(config: &Config, name: &str) -> toml::Table {
     let path = |path: PathBuf| toml::Value::from(path.to_string_lossy().into_owned());
     toml::Table::from_iter([
@@ -345,7 +350,7 @@ fn process_settings(config: &Config, name: &str) -> toml::Table {
     ])
 }
 
-/// Everything that the process of a run is told.
+/// All settings of a run's process.
 fn settings_of_process(config: &Config, name: &str, settings: &toml::Table) -> toml::Table {
     let mut all = settings.clone();
     all.extend(process_settings(config, name));

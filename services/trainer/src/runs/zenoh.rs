@@ -1,4 +1,4 @@
-//! Training runs over zenoh: queryables, and what is published of each run.
+//! Zenoh transport of training runs: queryables, and publication of progress.
 
 use crate::queries::serve;
 use crate::runs::Runs;
@@ -14,33 +14,34 @@ use wire::{Error, encode, key, query};
 use zenoh::Session;
 use zenoh::query::{Query, Queryable};
 
-/// What answers and publishes; it stops when this is dropped.
+/// Queryables and publisher of training runs, undeclared when dropped.
 #[derive(Debug)]
 pub(crate) struct RunsZenoh {
     _queryables: [Queryable<()>; 3],
     _publisher: AbortOnDropHandle<()>,
 }
 
-/// Answers for the trainer of this name, and publishes each change of a run.
+/// Declares the queryables of the trainer of this name, and publishes every change of its runs.
 ///
 /// # Errors
-/// If the name cannot stand in a key, or zenoh refuses a declaration.
+/// If the name is not valid in a key, or zenoh refuses a declaration.
 pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow::Result<RunsZenoh> {
     let key = key::trainer_start_run(name)?;
     ensure!(!key.is_wild(), "name: expected that of one trainer, got {name:?}");
     let zenoh = |e: zenoh::Error| anyhow!(e);
     let [start_key, stop_key, list_key] = [key, key::trainer_stop_run(name)?, key::trainer_list_runs(name)?];
+
     let (core, own) = (runs.clone(), start_key.clone());
     let start = move |query: &Query| {
         let answer = query::request(query).and_then(|request: StartRunRequest| core.start(&request));
-        watch("start_run", query, &answer);
+        report_refusal("start_run", query, &answer);
         query::reply_as(query, &own, answer.map(|run| StartRunResponse { run }))
     };
     let (core, own, runtime) = (runs.clone(), stop_key.clone(), Handle::current());
     let stop = move |query: &Query| {
         let stop = |request: StopRunRequest| runtime.block_on(core.stop(&request.name));
         let answer = query::request(query).and_then(stop);
-        watch("stop_run", query, &answer);
+        report_refusal("stop_run", query, &answer);
         query::reply_as(query, &own, answer.map(|run| StopRunResponse { run }))
     };
     let (core, own) = (runs.clone(), list_key.clone());
@@ -48,6 +49,7 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
         let answer = query::request(query).map(|_: ListRunsRequest| ListRunsResponse { runs: core.list() });
         query::reply_as(query, &own, answer)
     };
+
     let queryables = [
         serve(session, start_key, false, start).await.map_err(zenoh)?,
         serve(session, stop_key, false, stop).await.map_err(zenoh)?,
@@ -57,8 +59,8 @@ pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow:
     Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
 }
 
-/// A change that is refused leaves a trace.
-fn watch<R>(change: &'static str, query: &Query, answer: &Result<R, Error>) {
+/// Logs and counts a refused change.
+fn report_refusal<R>(change: &'static str, query: &Query, answer: &Result<R, Error>) {
     if let Err(error) = answer {
         CHANGES.refused(change, query.key_expr(), error);
     }

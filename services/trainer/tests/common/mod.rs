@@ -1,4 +1,4 @@
-//! Demonstrations of noise.
+//! Fixtures: demonstrations with random frames, checkpoints, sessions and recorders.
 
 #![allow(dead_code, reason = "each test file uses its part")]
 
@@ -17,12 +17,12 @@ use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpiso
 use wire::sim::Variation;
 use zenoh::Session;
 
-/// Of what every checkpoint says it was trained on.
+/// Data digest in the provenance of every checkpoint.
 pub const DATA_DIGEST: &str = "dddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddd";
-/// How every frame says it was rendered.
+/// Render spec of every frame.
 pub const SPEC: &str = r#"{"camera":"corner2"}"#;
 
-/// Step `step` of an episode: noise, and an action except at the end.
+/// Step `step` of an episode: a random frame, and an action except at the end.
 pub fn step(task: &str, seed: u64, steps: u32, step: u32) -> DemonstrationStep {
     let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + u64::from(step));
     let mut data = vec![0; images::BYTES];
@@ -44,7 +44,7 @@ pub fn steps(task: &str, seed: u64, count: u32) -> Vec<DemonstrationStep> {
     (0..count).map(|number| step(task, seed, count, number)).collect()
 }
 
-/// What is said of an episode of these steps.
+/// Metadata of an episode of these steps.
 pub fn info(task: &str, seed: u64, steps: &[DemonstrationStep]) -> RecordedEpisode {
     RecordedEpisode {
         episode_id: format!("{task}-{seed}"),
@@ -57,23 +57,23 @@ pub fn info(task: &str, seed: u64, steps: &[DemonstrationStep]) -> RecordedEpiso
     }
 }
 
-/// An episode with `count` steps.
+/// Episode with `count` steps.
 pub fn episode(task: &str, seed: u64, count: u32) -> Episode {
     let steps = steps(task, seed, count);
     Episode::new(info(task, seed, &steps), steps).unwrap()
 }
 
-/// The request that closes an episode.
+/// Commit of an episode.
 pub fn commit(episode: &Episode) -> CommitEpisodeRequest {
     CommitEpisodeRequest { episode: episode.info().clone() }
 }
 
-/// Keeps an episode in `folder`.
+/// Stores an episode in `folder`.
 pub fn keep(folder: &Path, episode: &Episode) {
     Recordings::open(folder.to_owned()).unwrap().keep(episode).unwrap();
 }
 
-/// A checkpoint of few, random weights.
+/// Checkpoint of a small, random model.
 pub fn checkpoint(seed: u64) -> Vec<u8> {
     let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
@@ -94,7 +94,7 @@ pub fn checkpoint(seed: u64) -> Vec<u8> {
     checkpoint::to_bytes(&Model::new(config, seed), &provenance).unwrap()
 }
 
-/// A session that listens, and one that connects to it.
+/// Two sessions: one listens, the other connects to it.
 pub async fn sessions(endpoint: &str) -> (Session, Session) {
     let listening = SessionConfig { listen: vec![endpoint.into()], ..SessionConfig::default() };
     let connecting = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
@@ -102,14 +102,14 @@ pub async fn sessions(endpoint: &str) -> (Session, Session) {
     (listening, service_kit::session::open(&connecting).await.unwrap())
 }
 
-/// Every recording of a folder, as bytes by path below it.
+/// Bytes of all recordings of a folder, by relative path.
 pub fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
     let paths = trainer::record::folder::paths(folder).unwrap();
     let name = |path: &Path| path.strip_prefix(folder).unwrap().display().to_string();
     paths.iter().map(|path| (name(path), std::fs::read(path).unwrap())).collect()
 }
 
-/// A recorder of `folder` on a session.
+/// Recorder of `folder` on a session.
 pub async fn record(
     session: &Session,
     folder: &Path,
