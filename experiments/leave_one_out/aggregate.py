@@ -5,6 +5,7 @@ tasks and their differences have percentile intervals of a stratified bootstrap:
 training seeds and the variations are drawn anew.
 """
 
+import hashlib
 import json
 import sys
 from dataclasses import dataclass
@@ -36,6 +37,8 @@ class Results:
     """Of each task and method, in the order of their training seeds."""
     variations: dict[str, list[int]]
     """Seeds of the variations of each task, the same for all methods."""
+    solved_at_reset: dict[str, list[int]]
+    """Seeds of those that were refused as trials: the task was solved before any action."""
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
@@ -46,15 +49,17 @@ class Results:
         """
         cells: dict[tuple[str, str], list[Cell]] = {}
         variations: dict[str, list[int]] = {}
+        solved_at_reset: dict[str, list[int]] = {}
         for path in sorted(folder.glob("*/*-*.json")):
             cell = json.loads(path.read_text()) | {"seed": int(path.stem.rpartition("-")[2])}
             expected = variations.setdefault(path.parent.name, cell["seeds"])
             if cell["seeds"] != expected:
                 raise ResultsError(f"{path}: expected the variations {expected}, got {cell['seeds']}")
+            solved_at_reset[path.parent.name] = cell["solved_at_reset"]
             cells.setdefault((path.parent.name, cell["cell"]["method"]), []).append(cell)
         if not cells:
             raise ResultsError(f"{folder}: expected results of at least one cell, got none")
-        return cls(cells, variations)
+        return cls(cells, variations, solved_at_reset)
 
     @property
     def tasks(self) -> list[str]:
@@ -90,6 +95,7 @@ def rate(results: Results, task: str, method: str) -> Cell:
         "trials": outcomes.size,
         "interval": _rounded(wilson.low, wilson.high),
         "mean_success_steps": round(float(np.mean(steps)), 1) if steps else None,
+        "mean_best_progress": round(float(np.mean([cell["best_progress"] for cell in cells])), 3),
     }
 
 
@@ -102,6 +108,9 @@ def mean(results: Results, method: str, tasks: list[str]) -> Cell:
         "tasks": len(tasks),
         "mean": round(float(np.mean([values.mean() for values in outcomes])), 4),
         "interval": _percentiles(draws),
+        "mean_best_progress": round(
+            float(np.mean([rate(results, task, method)["mean_best_progress"] for task in tasks])), 3
+        ),
     }
 
 
@@ -176,6 +185,12 @@ def cost(results: Results, task: str, method: str) -> list[Cell]:
     ]
 
 
+def variations_digest(results: Results) -> str:
+    """SHA-256 of a line `TASK SEED` for each variation, by task and seed."""
+    lines = [f"{task} {seed}\n" for task in results.tasks for seed in sorted(results.variations[task])]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 def summarise(results: Results) -> Cell:
     """All statistics, in JSON."""
     methods, cells = results.methods, [(task, method) for task in results.tasks for method in results.methods]
@@ -187,6 +202,8 @@ def summarise(results: Results) -> Cell:
         "tasks": results.tasks,
         "methods": methods,
         "variations": results.variations,
+        "variations_digest": variations_digest(results),
+        "solved_at_reset": results.solved_at_reset,
         "rates": [rate(results, *key) for key in cells],
         "means": [mean(results, method, complete) for method in methods] if complete else [],
         "comparisons": [compare(results, *pair) for pair in combinations(methods, 2) if results.common(*pair)],

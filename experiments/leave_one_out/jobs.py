@@ -66,7 +66,7 @@ def evaluate(folder: Path, cell: Cell) -> Cell:
         link.unlink(missing_ok=True)
         link.symlink_to(training / "model.safetensors")
 
-    options = [f"--{name}={value}" for name, value in cell["options"].items()]
+    options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in cell["options"].items()]
     options += ["--models", cell["method"], "--tasks", cell["fold"], "--trials", str(cell["trials"])]
     with Lab(folder) as lab:
         lab.planner(models)
@@ -78,15 +78,18 @@ def evaluate(folder: Path, cell: Cell) -> Cell:
     trials = [json.loads(path.read_text()) for path in paths]
     # A variation that came to be left out later may have a record.
     trials = sorted(trials, key=lambda trial: trial["seed"])[: cell["trials"]]
+    attempts = [trial for trial in trials if trial["outcome"] in ("success", "failure")]
     return {
         "evaluator": {key: value for key, value in run.items() if key not in ELSEWHERE},
         "weights": run["models"][0]["digest"],
         "trained": trained,
-        "seeds": [trial["seed"] for trial in trials],
-        "successes": [int(trial["outcome"] == "success") for trial in trials],
-        "steps": [trial["episode"]["steps"] for trial in trials],
-        "plan_ms": _mean_ms(trials, "plan_seconds"),
-        "encode_ms": _mean_ms(trials, "encode_seconds"),
+        "seeds": [trial["seed"] for trial in attempts],
+        "successes": [int(trial["outcome"] == "success") for trial in attempts],
+        "steps": [trial["episode"]["steps"] for trial in attempts],
+        "best_progress": [round(max(trial["episode"].get("progress", [])), 3) for trial in attempts],
+        "solved_at_reset": [trial["seed"] for trial in trials if trial["outcome"] == "solved-at-reset"],
+        "plan_ms": _mean_ms(attempts, "plan_seconds"),
+        "encode_ms": _mean_ms(attempts, "encode_seconds"),
     }
 
 

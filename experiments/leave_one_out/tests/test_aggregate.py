@@ -12,7 +12,8 @@ SEEDS = [1_000_000, 1_000_001, 1_000_002, 1_000_003]
 
 
 def write(folder: Path, task: str, method: str, successes: list[int], seed: int = 0, seeds: list[int] = SEEDS) -> None:
-    cell = {"cell": {"method": method}, "seeds": seeds, "successes": successes, "steps": [10, 20, 30, 40]}
+    trials = {"seeds": seeds, "successes": successes, "steps": [10, 20, 30, 40], "best_progress": [0.1, 0.2, 0.3, 1.0]}
+    cell = {"cell": {"method": method}, **trials, "solved_at_reset": []}
     (folder / task).mkdir(parents=True, exist_ok=True)
     (folder / task / f"{method}-{seed}.json").write_text(json.dumps(cell))
 
@@ -25,6 +26,7 @@ def test_a_rate_pools_the_training_seeds_and_has_the_interval_of_wilson(tmp_path
     # statsmodels: proportion_confint(3, 8, method="wilson").
     assert row["interval"] == [0.1368, 0.6943]
     assert row["mean_success_steps"] == 23.3
+    assert row["mean_best_progress"] == 0.4
 
 
 def test_pairs_are_trials_of_one_variation_and_training_seed(tmp_path: Path) -> None:
