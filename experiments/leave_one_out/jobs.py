@@ -6,6 +6,7 @@ simulator's environment.
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -62,9 +63,8 @@ def evaluate(folder: Path, cell: Cell) -> Cell:
     if cell["training"]:
         training = folder.parents[2] / "training" / cell["fold"] / cell["training"]
         trained = json.loads((training / "cell.json").read_text())
-        link = models / f"{cell['method']}.safetensors"
-        link.unlink(missing_ok=True)
-        link.symlink_to(training / "model.safetensors")
+        # A copy: a planner opens nothing outside of its folder.
+        shutil.copyfile(training / "model.safetensors", models / f"{cell['method']}.safetensors")
 
     options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in cell["options"].items()]
     options += ["--models", cell["method"], "--tasks", cell["fold"], "--trials", str(cell["trials"])]
