@@ -4,6 +4,7 @@ A job leaves `cell.json` in its folder at its end. Interrupted, it goes on from 
 simulator's environment.
 """
 
+import fcntl
 import hashlib
 import json
 import shutil
@@ -41,8 +42,10 @@ def train_fold(folder: Path, cell: Cell) -> Cell:
     options += ["--dataset", str(recordings), "--run-dir", str(journal)]
     for name, value in cell["settings"].items():
         options += ["--set", f"{name}={value}"]
-    with Lab(folder) as lab:
-        train(lab, checkpoint, *options)
+    # The trainer writes it last. Killed just after, the job need not train again.
+    if not checkpoint.exists():
+        with Lab(folder) as lab:
+            train(lab, checkpoint, *options)
 
     progress = json.loads((journal / "progress.jsonl").read_text().splitlines()[-1])
     provenance = _provenance(checkpoint)
@@ -119,10 +122,14 @@ JOBS = {"demonstrate": demonstrate, "train": train_fold, "evaluate": evaluate}
 def job() -> None:
     """Runs a job, and leaves its cell with its result."""
     name, folder, cell = sys.argv[1], Path(sys.argv[2]).absolute(), json.loads(sys.argv[3])
-    contents = json.dumps({"cell": cell, **JOBS[name](folder, cell), "processor": _processor()}) + "\n"
-    partial = folder / "cell.json.partial"
-    partial.write_text(contents)
-    partial.replace(folder / "cell.json")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".job.lock").open("w") as lock:
+        # Where Snakemake alone was killed, its job may still be at work.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        contents = json.dumps({"cell": cell, **JOBS[name](folder, cell), "processor": _processor()}) + "\n"
+        partial = folder / "cell.json.partial"
+        partial.write_text(contents)
+        partial.replace(folder / "cell.json")
 
 
 if __name__ == "__main__":

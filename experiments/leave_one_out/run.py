@@ -36,7 +36,7 @@ def main() -> None:
 
     snakemake = Path(sys.executable).with_name("snakemake")
     command = [str(snakemake), "--snakefile", str(HERE / "Snakefile"), "--directory", str(arguments.folder)]
-    command += ["--profile", str(HERE / "engines/common")]
+    command += ["--profile", str(HERE / "common")]
     command += ["--workflow-profile", str(HERE / "engines" / arguments.engine)]
     command += ["--configfile", str(HERE / "profiles" / f"{arguments.profile}.yaml")]
     os.execv(snakemake, [*command, *options])
