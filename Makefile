@@ -73,7 +73,7 @@ dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check t
 jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint errors, pokes, a picture of the trajectories
 	$(WORKER)/bin/python experiments/jenga/run.py
 
-experiment: build $(EXPERIMENT)/.ready ## Leave each task out, train, evaluate, report; goes on where it was interrupted (PROFILE=smoke|desk|paper, JOBS=n, ENGINE=local|slurm|kubernetes)
+experiment: build $(EXPERIMENT)/.ready ## Leave each task out, train, evaluate, report; goes on where it was interrupted (PROFILE=smoke|desk|paper, JOBS=n, ENGINE=local|slurm)
 	$(EXPERIMENT)/bin/python experiments/leave_one_out/run.py --profile $(or $(PROFILE),smoke) \
 		--engine $(or $(ENGINE),local) --jobs $(or $(JOBS),$(shell nproc))
 
