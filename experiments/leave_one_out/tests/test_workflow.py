@@ -128,10 +128,12 @@ def test_what_is_finished_is_not_run_again(folder: Path, tmp_path: Path) -> None
     assert "rule train" in again
 
 
-@pytest.mark.skipif(
-    shutil.which("sinfo") is None or subprocess.run(["sinfo"], capture_output=True).returncode != 0,
-    reason="no Slurm answers",
-)
+def slurm_answers() -> bool:
+    sinfo = shutil.which("sinfo")
+    return sinfo is not None and subprocess.run([sinfo], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not slurm_answers(), reason="no Slurm answers")
 def test_the_experiment_runs_through_slurm_and_is_finished_there_too(tmp_path: Path) -> None:
     log = run(tmp_path, "--engine", "slurm", "--cores", "2")
     assert "has been submitted with SLURM jobid" in log
