@@ -38,7 +38,7 @@ def draw(summary: Summary) -> str:
     axes[0][0].set_ylim(len(tasks) - 0.5, -0.5)
     figure.supxlabel("first-attempt success rate, with its 95 % interval", fontsize=9)
     with io.StringIO() as file:
-        figure.savefig(file, format="svg", metadata={"Date": None})
+        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
         plt.close(figure)
         svg = file.getvalue()
     return svg[svg.index("<svg") :]

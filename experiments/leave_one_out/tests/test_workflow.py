@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -71,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("leave_one_out") / "runs"
     kill_when(folder, lambda: any(folder.glob("demonstrations/*/recordings/*/*.mcap")))
     kill_when(folder, lambda: any(folder.glob("training/*/*/run/progress.jsonl")))
-    kill_when(folder, lambda: len(list(folder.glob("evaluation/**/trials/**/*.json"))) >= 3)
+    kill_when(folder, lambda: any(folder.glob("evaluation/**/trials/*/cpn/*.json")))
     before = finished(folder)
     assert before
     run(folder)
@@ -94,7 +95,7 @@ def test_a_killed_experiment_goes_on_and_every_cell_says_what_it_is_made_of(fold
             assert len(result["trained"]["data_digest"]) == 64
     report = (folder / "smoke/report.html").read_text()
     assert report.startswith("<!doctype html>")
-    assert "http" not in report.replace("http://www.w3.org", "").replace("http://purl.org", ""), "not self-contained"
+    assert not re.search(r'(src|href)="[^#]', report), "not self-contained"
 
 
 def test_a_folder_has_one_run_at_a_time(folder: Path) -> None:
