@@ -95,7 +95,7 @@ def rate(results: Results, task: str, method: str) -> Cell:
         "trials": outcomes.size,
         "interval": _rounded(wilson.low, wilson.high),
         "mean_success_steps": round(float(np.mean(steps)), 1) if steps else None,
-        "mean_best_progress": round(float(np.mean([cell["best_progress"] for cell in cells])), 3),
+        "mean_best_progress": _mean([value for cell in cells for value in cell["best_progress"]]),
     }
 
 
@@ -108,9 +108,7 @@ def mean(results: Results, method: str, tasks: list[str]) -> Cell:
         "tasks": len(tasks),
         "mean": round(float(np.mean([values.mean() for values in outcomes])), 4),
         "interval": _percentiles(draws),
-        "mean_best_progress": round(
-            float(np.mean([rate(results, task, method)["mean_best_progress"] for task in tasks])), 3
-        ),
+        "mean_best_progress": _mean([rate(results, task, method)["mean_best_progress"] for task in tasks]),
     }
 
 
@@ -153,6 +151,12 @@ def _bootstrap(tasks: list[tuple[NDArray[np.float64], ...]]) -> list[NDArray[np.
             seeds = generator.integers(len(outcomes), size=(RESAMPLES, len(outcomes), 1))
             total += outcomes[seeds, variations].mean((1, 2))
     return [total / len(tasks) for total in sums]
+
+
+def _mean(values: list[float | None]) -> float | None:
+    """Mean; none if a value is missing."""
+    known = [value for value in values if value is not None]
+    return round(float(np.mean(known)), 3) if len(known) == len(values) else None
 
 
 def _percentiles(draws: NDArray[np.float64]) -> list[float]:

@@ -89,7 +89,7 @@ def evaluate(folder: Path, cell: Cell) -> Cell:
         "seeds": [trial["seed"] for trial in attempts],
         "successes": [int(trial["outcome"] == "success") for trial in attempts],
         "steps": [trial["episode"]["steps"] for trial in attempts],
-        "best_progress": [round(max(trial["episode"]["progress"]), 3) for trial in attempts],
+        "best_progress": [_best_progress(trial["episode"]) for trial in attempts],
         "solved_at_reset": [trial["seed"] for trial in trials if trial["outcome"] == "solved-at-reset"],
         "plan_ms": _mean_ms(attempts, "plan_seconds"),
         "encode_ms": _mean_ms(attempts, "encode_seconds"),
@@ -101,6 +101,12 @@ def _mean_ms(trials: list[Cell], stage: str) -> float:
     episodes = [trial["episode"] for trial in trials]
     total = sum(episode["steps"] * episode["mean_times"][stage] for episode in episodes)
     return round(1e3 * total / max(1, sum(episode["steps"] for episode in episodes)), 3)
+
+
+def _best_progress(episode: Cell) -> float | None:
+    """Highest progress of an episode; none where the simulator does not measure it."""
+    progress = episode.get("progress")
+    return round(max(progress), 3) if progress else None
 
 
 def _provenance(checkpoint: Path) -> Cell:
