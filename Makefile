@@ -10,6 +10,7 @@ BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
+EXPERIMENT := experiments/leave_one_out/.venv
 # Sources of cpn-messages, a dependency of several environments.
 MESSAGES := messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
 COMPOSE ?= docker-compose
@@ -18,7 +19,7 @@ PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tes
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench test-experiment fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -63,6 +64,10 @@ $(STACK)/.ready: tests/stack/pyproject.toml tests/stack/uv.lock $(MESSAGES) | $(
 	cd tests/stack && $(UV) sync --quiet --locked
 	touch $@
 
+$(EXPERIMENT)/.ready: experiments/leave_one_out/pyproject.toml experiments/leave_one_out/uv.lock | $(UV)
+	cd experiments/leave_one_out && $(UV) sync --quiet --locked
+	touch $@
+
 build: setup ## Compile the services
 	cargo build --release --locked
 
@@ -74,6 +79,16 @@ dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check t
 
 jenga: build ## The paper's Jenga experiment in the simulated arm: endpoint errors, pokes, a picture of the trajectories
 	$(WORKER)/bin/python experiments/jenga/run.py
+
+experiment: build $(EXPERIMENT)/.ready ## Leave each task out, train, evaluate, report; goes on where it was interrupted (PROFILE=smoke|desk|paper, JOBS=n, EXECUTOR=local|slurm)
+	$(EXPERIMENT)/bin/python experiments/leave_one_out/run.py --profile $(or $(PROFILE),smoke) \
+		--executor $(or $(EXECUTOR),local) --jobs $(or $(JOBS),$(shell nproc))
+
+experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the experiment again, from the committed results
+	for results in docs/results/leave_one_out/*/; do \
+		$(EXPERIMENT)/bin/python experiments/leave_one_out/aggregate.py $$results && \
+		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
+	done
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	$(WORKER)/bin/python experiments/models.py
@@ -130,6 +145,9 @@ test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, with
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
 	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-experiment: build $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
+	cd experiments/leave_one_out && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
 fuzz: system .libtorch/build-version ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
 	scripts/fuzz.sh
 
@@ -168,4 +186,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target $(WORKER) $(EXAMPLES) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) .libtorch
+	rm -rf target fuzz/target $(WORKER) $(EXAMPLES) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
