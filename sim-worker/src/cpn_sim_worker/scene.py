@@ -54,6 +54,11 @@ class Scene(Protocol):
         ...
 
     @property
+    def action_metres(self) -> float:
+        """Displacement of the hand's set point by an action of 1, in metres."""
+        ...
+
+    @property
     def control_hz(self) -> float:
         """Actions per second of simulated time."""
         ...
@@ -71,6 +76,16 @@ class Scene(Protocol):
     @property
     def goal_position(self) -> NDArray[np.float64]:
         """Where the goal of the running variation is, [3] in metres; [0] for tasks whose goal is a picture."""
+        ...
+
+    @property
+    def solved(self) -> bool:
+        """Whether the task is solved in the present state."""
+        ...
+
+    @property
+    def progress(self) -> float:
+        """Progress towards success in the present state, 0 to 1."""
         ...
 
     def reset(self, seed: int) -> NDArray[np.float64]:
