@@ -15,7 +15,10 @@ def test_expert_solves_task_and_its_actions_replay(simulator: Simulator, task: s
     goal_state = simulator.scene.data.qpos.copy()
     assert moments[-1].action is None
     assert moments[-1].arrival.success
+    solved_progress = simulator.scene.progress
     start = simulator.reset(task, 1)
+    assert not simulator.scene.solved
+    assert 0 <= simulator.scene.progress < solved_progress <= 1
     assert np.array_equal(start, moments[0].arrival.state)
     for before, after in pairwise(moments):
         assert before.action is not None

@@ -42,8 +42,10 @@ def action(*values: float) -> NDArray[np.float32]:
 def solve(scene: JengaScene, seed: int) -> tuple[int, float]:
     """Steps until the expert succeeds, and the reward once the hand has come to rest."""
     state = scene.reset(seed)
+    assert (scene.solved, scene.progress) == (False, 0)
     for step in range(1, 61):
         transition = scene.step(scene.expert(state))
+        assert scene.solved == transition.success == (scene.progress == 1)
         state = transition.state
         if transition.success:
             for _ in range(3):

@@ -90,6 +90,28 @@ def test_reset_is_reproducible_and_ends_the_episode_before(worker: Worker) -> No
     assert first.episode_id in caught.value.got
 
 
+def test_reset_tells_where_the_hand_is_in_the_goal_image(worker: Worker) -> None:
+    """Towards it, an action of 1 displaces the hand by so many metres."""
+    start, other = worker.reset(), worker.reset(goal_seed=SEED + 1)
+    assert other.goal_hand_position == worker.reset(seed=SEED + 1).goal_hand_position != start.goal_hand_position
+    start = worker.reset()
+    assert (start.control.action_size, start.control.metres) == (4, pytest.approx(0.01))
+    assert start.control.hz == pytest.approx(80)
+    assert not start.success
+    goal, hand, progress = np.array(start.goal_hand_position), start.hand_position, [start.progress]
+    distances = [np.linalg.norm(goal - hand)]
+    for step in range(6):
+        action = np.append(np.clip((goal - hand) / start.control.metres, -1, 1), 0)
+        response = worker.step(start.episode_id, step, tuple(action))
+        hand = response.hand_position
+        distances.append(np.linalg.norm(goal - hand))
+        progress.append(response.progress)
+    assert distances[-1] < distances[0] - 0.02
+    # The task is to reach that point.
+    assert sorted(progress) == progress
+    assert progress[0] < progress[-1] < 1
+
+
 def test_goal_of_another_variation(worker: Worker) -> None:
     here, there = worker.reset(seed=SEED), worker.reset(seed=SEED + 1)
     mixed = worker.reset(seed=SEED, goal_seed=SEED + 1)
@@ -114,9 +136,10 @@ def test_jenga_is_served_by_the_same_worker(worker: Worker) -> None:
     moved = np.subtract(response.hand_position, start.hand_position)
     assert 0.002 < moved[0] < 0.01
     assert np.abs(moved[1:]).max() < 0.002
+    assert (start.control.action_size, start.control.metres, start.control.hz) == (3, 0.01, 10)
     from_goal = np.subtract(response.hand_position, start.goal_position)
     assert response.reward == pytest.approx(-np.linalg.norm(from_goal), abs=1e-6)
-    assert not worker.reset().hand_position
+    assert not worker.reset().goal_position
     with pytest.raises(RequestError, match=r"INVALID_ARGUMENT variation.seed: expected at least 1000000, got 3"):
         worker.reset("jenga-poke-offset", 3)
     worker.reset()

@@ -4,7 +4,7 @@ use crate::Error;
 use prost::Message as _;
 
 /// Maximum length of an action.
-const MAX_ACTION: usize = 64;
+pub(crate) const MAX_ACTION: usize = 64;
 
 /// Native type of a protobuf message; the conversion from the message validates every field.
 pub trait Message: TryFrom<Self::Proto, Error = Error> + Into<Self::Proto> {

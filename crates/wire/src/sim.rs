@@ -1,6 +1,6 @@
 //! Requests and responses of a simulator worker.
 
-use crate::message::{action, required};
+use crate::message::{MAX_ACTION, action, required};
 use crate::{Error, Image, Message, Position, proto};
 
 /// Randomised initial state of an episode.
@@ -34,8 +34,27 @@ pub struct ResetResponse {
     pub max_steps: u32,
     /// Goal position, if the goal is one.
     pub goal_position: Option<Position>,
-    /// Position of the hand, if the goal is a position.
-    pub hand_position: Option<Position>,
+    /// Position of the hand.
+    pub hand_position: Position,
+    /// Position of the hand in the goal image.
+    pub goal_hand_position: Position,
+    /// Whether the task is solved before any action.
+    pub success: bool,
+    /// Progress towards success before any action, 0 to 1.
+    pub progress: f64,
+    /// How actions move the hand.
+    pub control: Control,
+}
+
+/// Control of the hand.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Control {
+    /// Number of values in an action, 3 to 64. The first three displace the hand along x, y and z.
+    pub action_size: u32,
+    /// Displacement of the hand's set point by a value of 1, in metres.
+    pub metres: f64,
+    /// Steps per second of simulated time.
+    pub hz: f64,
 }
 
 /// Request to apply one action, exactly once.
@@ -60,8 +79,10 @@ pub struct StepResponse {
     pub success: bool,
     /// Whether the episode is over.
     pub done: bool,
-    /// Position of the hand after the action, if the goal is a position.
-    pub hand_position: Option<Position>,
+    /// Position of the hand after the action.
+    pub hand_position: Position,
+    /// Progress towards success after the action, 0 to 1.
+    pub progress: f64,
 }
 
 impl TryFrom<proto::Variation> for Variation {
@@ -109,8 +130,15 @@ impl TryFrom<proto::ResetResponse> for ResetResponse {
             goal: required("goal", response.goal)?,
             observation: required("observation", response.observation)?,
             max_steps: response.max_steps,
-            goal_position: position("goal_position", &response.goal_position)?,
+            goal_position: match response.goal_position.as_slice() {
+                [] => None,
+                values => Some(position("goal_position", values)?),
+            },
             hand_position: position("hand_position", &response.hand_position)?,
+            goal_hand_position: position("goal_hand_position", &response.goal_hand_position)?,
+            success: response.success,
+            progress: progress(response.progress)?,
+            control: required("control", response.control)?,
         })
     }
 }
@@ -122,9 +150,35 @@ impl From<ResetResponse> for proto::ResetResponse {
             goal: Some(response.goal.into()),
             observation: Some(response.observation.into()),
             max_steps: response.max_steps,
-            goal_position: metres(response.goal_position),
+            goal_position: response.goal_position.map(metres).unwrap_or_default(),
             hand_position: metres(response.hand_position),
+            goal_hand_position: metres(response.goal_hand_position),
+            success: response.success,
+            progress: response.progress,
+            control: Some(response.control.into()),
         }
+    }
+}
+
+impl TryFrom<proto::Control> for Control {
+    type Error = Error;
+
+    fn try_from(proto::Control { action_size, metres, hz }: proto::Control) -> Result<Self, Error> {
+        if !(3..=MAX_ACTION as u32).contains(&action_size) {
+            return Err(Error::invalid("action_size", format!("3 to {MAX_ACTION}"), action_size));
+        }
+        for (field, value) in [("metres", metres), ("hz", hz)] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Error::invalid(field, "a finite number above 0", value));
+            }
+        }
+        Ok(Self { action_size, metres, hz })
+    }
+}
+
+impl From<Control> for proto::Control {
+    fn from(Control { action_size, metres, hz }: Control) -> Self {
+        Self { action_size, metres, hz }
     }
 }
 
@@ -169,26 +223,32 @@ impl TryFrom<proto::StepResponse> for StepResponse {
             success: response.success,
             done: response.done,
             hand_position: position("hand_position", &response.hand_position)?,
+            progress: progress(response.progress)?,
         })
     }
 }
 
 impl From<StepResponse> for proto::StepResponse {
     fn from(response: StepResponse) -> Self {
-        let StepResponse { observation, reward, success, done, hand_position } = response;
-        Self { observation: Some(observation.into()), reward, success, done, hand_position: metres(hand_position) }
+        let StepResponse { observation, reward, success, done, hand_position, progress } = response;
+        let (observation, hand_position) = (Some(observation.into()), metres(hand_position));
+        Self { observation, reward, success, done, hand_position, progress }
     }
 }
 
-/// Validates a position x, y, z in metres, or no values for none.
-fn position(field: &str, values: &[f32]) -> Result<Option<Position>, Error> {
+/// Validates a position x, y, z in metres.
+fn position(field: &str, values: &[f32]) -> Result<Position, Error> {
     match *values {
-        [] => Ok(None),
-        [x, y, z] => Position::new([x, y, z]).map(Some).map_err(|e| e.within(field)),
-        _ => Err(Error::invalid(field, "0 or 3 values", values.len())),
+        [x, y, z] => Position::new([x, y, z]).map_err(|e| e.within(field)),
+        _ => Err(Error::invalid(field, "3 values", values.len())),
     }
 }
 
-fn metres(position: Option<Position>) -> Vec<f32> {
-    position.map(Position::metres).into_iter().flatten().collect()
+fn metres(position: Position) -> Vec<f32> {
+    position.metres().into()
+}
+
+fn progress(value: f64) -> Result<f64, Error> {
+    // Written so that NaN, which compares false with everything, is refused too.
+    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err(Error::invalid("progress", "0 to 1", value)) }
 }

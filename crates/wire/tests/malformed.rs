@@ -7,7 +7,7 @@ use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::proto::plan_request::{Goal, Observed};
-use wire::sim::{StepRequest, StepResponse};
+use wire::sim::{ResetResponse, StepRequest, StepResponse};
 use wire::training::{Run, StartRunRequest};
 use wire::{Code, Error, decode, proto};
 
@@ -135,6 +135,33 @@ fn a_position_of_two_values_is_refused() {
     let response = proto::StepResponse { observation, hand_position: vec![0.0; 2], ..Default::default() };
     let error = decode::<StepResponse>(&response.encode_to_vec()).unwrap_err();
     assert_eq!((error.field.as_str(), error.got.as_str()), ("hand_position", "2"));
+}
+
+#[test]
+fn progress_and_control_of_no_sense_are_refused() {
+    let sound = proto::ResetResponse {
+        goal: Some(black(84)),
+        observation: Some(black(84)),
+        hand_position: vec![0.0; 3],
+        goal_hand_position: vec![0.0; 3],
+        control: Some(proto::Control { action_size: 4, metres: 0.01, hz: 80.0 }),
+        ..Default::default()
+    };
+    decode::<ResetResponse>(&sound.encode_to_vec()).unwrap();
+    type Spoil = fn(&mut proto::ResetResponse);
+    let cases: [(Spoil, &str); 6] = [
+        (|it| it.progress = f64::NAN, "progress"),
+        (|it| it.progress = 1.5, "progress"),
+        (|it| it.control = None, "control"),
+        (|it| it.control.as_mut().unwrap().action_size = 2, "control.action_size"),
+        (|it| it.control.as_mut().unwrap().metres = 0.0, "control.metres"),
+        (|it| it.control.as_mut().unwrap().hz = f64::INFINITY, "control.hz"),
+    ];
+    for (spoil, field) in cases {
+        let mut response = sound.clone();
+        spoil(&mut response);
+        assert_eq!(decode::<ResetResponse>(&response.encode_to_vec()).unwrap_err().field, field);
+    }
 }
 
 #[test]

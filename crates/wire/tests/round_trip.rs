@@ -41,6 +41,10 @@ fn point() -> impl Strategy<Value = Position> {
     proptest::array::uniform3(-1000.0f32..=1000.0).prop_map(|metres| Position::new(metres).unwrap())
 }
 
+fn control() -> impl Strategy<Value = Control> {
+    (3u32..=64, 1e-3..1.0, 1.0..1e3).prop_map(|(action_size, metres, hz)| Control { action_size, metres, hz })
+}
+
 fn search() -> impl Strategy<Value = Search> {
     let solver = prop_oneof![Just(Solver::Gradient), Just(Solver::Cem), Just(Solver::Mppi), Just(Solver::Hybrid)];
     (solver, option::of(0u32..=1000), option::of(2u32..=4096), any::<bool>()).prop_map(
@@ -215,12 +219,24 @@ proptest! {
         action in action(),
         reward in -9.0..9.0,
         (success, done) in any::<(bool, bool)>(),
-        (goal_position, hand_position) in (option::of(point()), option::of(point())),
+        (goal_position, hand_position, goal_hand_position) in (option::of(point()), point(), point()),
+        (progress, control) in (0.0..=1.0, control()),
     ) {
         survives(ResetRequest { variation, goal_seed: success.then_some(u64::from(step)) });
         survives(StepRequest { episode_id: episode_id.clone(), step, action });
-        survives(StepResponse { observation: observation.clone(), reward, success, done, hand_position });
-        survives(ResetResponse { episode_id, goal, observation, max_steps: step, goal_position, hand_position });
+        survives(StepResponse { observation: observation.clone(), reward, success, done, hand_position, progress });
+        survives(ResetResponse {
+            episode_id,
+            goal,
+            observation,
+            max_steps: step,
+            goal_position,
+            hand_position,
+            goal_hand_position,
+            success,
+            progress,
+            control,
+        });
     }
 
     #[test]

@@ -121,7 +121,7 @@ fn x_of(rate: f64) -> f64 {
     LEFT + rate * (WIDTH - LEFT - RIGHT)
 }
 
-/// A latent distance over the steps of an episode, drawn beneath the frames of its filmstrip: the step of a frame lies
+/// A value over the steps of an episode, drawn beneath the frames of its filmstrip: the step of a frame lies
 /// under the frame.
 #[derive(Debug, Serialize)]
 pub(crate) struct Line {
@@ -138,22 +138,23 @@ impl Line {
     const HEIGHT: f64 = 56.0;
     const PADDING: f64 = 4.0;
 
-    /// None without any value. `frames` is the number of frames above, evenly spaced over the steps.
-    pub(crate) fn new(values: &[Option<f32>], steps: u32, frames: usize) -> Option<Self> {
-        let known: Vec<f32> = values.iter().flatten().copied().collect();
+    /// None without any value. Each value stands beside its step; `frames` is the number of frames above, evenly spaced over the
+    /// steps.
+    pub(crate) fn new(values: &[(u32, Option<f32>)], steps: u32, frames: usize) -> Option<Self> {
+        let known: Vec<f32> = values.iter().filter_map(|(_, value)| *value).collect();
         let (first, last) = (*known.first()?, *known.last()?);
         let greatest = known.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
         let frame_width = Self::WIDTH / FRAMES as f64;
-        let point = |step: usize, value: f32| {
-            let share = step as f64 / f64::from(steps.max(1));
+        let point = |step: u32, value: f32| {
+            let share = f64::from(step) / f64::from(steps.max(1));
             let x = frame_width * (0.5 + share * frames.saturating_sub(1) as f64);
             let y = Self::HEIGHT - Self::PADDING - f64::from(value / greatest) * (Self::HEIGHT - 2.0 * Self::PADDING);
             format!("{x:.1},{y:.1}")
         };
         let mut lines = vec![Vec::new()];
-        for (step, value) in values.iter().enumerate() {
+        for &(step, value) in values {
             match (value, lines.last_mut()) {
-                (Some(value), Some(line)) => line.push(point(step, *value)),
+                (Some(value), Some(line)) => line.push(point(step, value)),
                 _ => lines.push(Vec::new()),
             }
         }
@@ -169,10 +170,10 @@ mod tests {
 
     #[test]
     fn a_line_ends_under_the_last_frame_and_breaks_at_a_gap() {
-        let values = [Some(4.0), Some(2.0), None, Some(1.0), Some(0.0)];
+        let values = [(0, Some(4.0)), (1, Some(2.0)), (2, None), (3, Some(1.0)), (4, Some(0.0))];
         let line = Line::new(&values, 5, 6).unwrap();
         assert_eq!(line.lines, ["50.0,4.0 150.0,28.0", "350.0,40.0 450.0,52.0"]);
         assert_eq!((line.first, line.last), (4.0, 0.0));
-        assert!(Line::new(&[None], 1, 2).is_none());
+        assert!(Line::new(&[(0, None)], 1, 2).is_none());
     }
 }

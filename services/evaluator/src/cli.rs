@@ -1,5 +1,7 @@
 //! The command line.
 
+use crate::compare::Sources;
+use crate::planning::Planning;
 use crate::record::{FIRST_EVALUATION_SEED, GoalSource};
 use clap::{Args, Parser, Subcommand, value_parser};
 use service_kit::SessionConfig;
@@ -21,6 +23,8 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Report again from the records of an evaluation.
     Report(ReportArgs),
+    /// Compare two arms on the same variations: discordant pairs, exact McNemar test, difference of success rates with its interval.
+    Compare(CompareArgs),
     /// Replay a recorded episode's plan requests, and compare the plans bit for bit.
     Replay(Box<ReplayArgs>),
 }
@@ -34,7 +38,8 @@ pub struct RunArgs {
     /// Minimum number of simulator workers; all that are alive are used.
     #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
     pub workers: u32,
-    /// Models to compare, separated by commas [default: every model of the planner].
+    /// Models to compare, separated by commas. Controls that need no planner: `no-op`, zero action; `oracle`, straight line to the
+    /// hand's position in the goal image, gripper zero [default: every model of the planner].
     #[arg(long, value_delimiter = ',')]
     pub models: Vec<String>,
     /// Tasks to evaluate on, separated by commas.
@@ -49,6 +54,9 @@ pub struct RunArgs {
     /// Variation whose end the goal image shows. Another one than the trial's is an ablation, which the report mentions.
     #[arg(long, value_enum, default_value_t = GoalSource::SameVariation)]
     pub goal: GoalSource,
+    /// Plans in closed loop.
+    #[command(flatten)]
+    pub planning: Planning,
     /// Folder of records and report.
     #[arg(long)]
     pub out: PathBuf,
@@ -79,6 +87,18 @@ pub struct ReportArgs {
     #[arg(long)]
     pub out: PathBuf,
     /// Print the summary as JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `compare`.
+#[derive(Debug, Clone, Args)]
+pub struct CompareArgs {
+    /// First arm: FOLDER of an evaluation, or FOLDER:MODEL. Several, separated by commas, are training runs, or other tasks.
+    pub a: Sources,
+    /// Second arm, likewise; differences are A - B.
+    pub b: Sources,
+    /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
 }

@@ -78,6 +78,7 @@ fn name(trial: &Trial) -> String {
     let outcome = match trial.outcome {
         Outcome::Success => "success",
         Outcome::Failure => "failure",
+        Outcome::SolvedAtReset => "solved",
         Outcome::Error { .. } => "error",
     };
     let digest: String = trial.model_digest.chars().take(12).collect();
@@ -106,12 +107,15 @@ fn png(image: &Image) -> anyhow::Result<Vec<u8>> {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
+    use crate::planning::Planning;
     use crate::record::{Episode, GoalSource, StageTimes};
 
     fn trial(seed: u64, digest: &str, outcome: Outcome) -> Trial {
         let episode = Episode {
             goal_id: "0".repeat(64),
             steps: 2,
+            progress: vec![],
+            plan_steps: vec![],
             latent_distances: vec![],
             first_inner_losses: vec![],
             last_inner_losses: vec![],
@@ -124,6 +128,7 @@ mod tests {
             model: "cpn".into(),
             model_digest: digest.repeat(64),
             goal: GoalSource::SameVariation,
+            planning: Planning::default(),
             outcome,
             episode: Some(episode),
         }

@@ -1,17 +1,23 @@
 //! Measures first-attempt success: closes the loop between simulator workers and planners, records every trial, and
 //! reports rates with their confidence intervals.
 //!
-//! Every model is run on the same variations (`queue`), one trial at a time on each worker (`schedule`, `trial`), spread
-//! over the planners (`planners`). Outages of routers and services are waited for (`link`, `presence`), or the trial begins
+//! Every model, and every control (`control`), is run on the same variations (`queue`), one trial at a time on each worker
+//! (`schedule`, `trial`, `actor`), spread over the planners (`planners`), with plans as they are set (`planning`). Outages of routers and services are waited for (`link`, `presence`), or the trial begins
 //! anew from its seed, so that the results are the same as without. The records (`record`, `filmstrip`) are all that the
-//! report (`summary`, `table`, `report`) is made from, so that a run can be interrupted and gone on with. What a planner
-//! was asked in an episode can be asked again (`replay`).
+//! report (`summary`, `table`, `report`) is made from, so that a run can be interrupted and gone on with. Two
+//! models on the same variations are compared by them (`compare`, `paired`). What a planner was asked in an episode can be asked
+//! again (`replay`).
 
+mod actor;
 mod chart;
 mod cli;
+mod compare;
+mod control;
 mod filmstrip;
 mod link;
+mod paired;
 mod planners;
+mod planning;
 mod presence;
 mod progress;
 mod queue;
@@ -23,13 +29,17 @@ mod summary;
 mod table;
 mod trial;
 
-pub use cli::{Cli, Command, ReplayArgs, ReportArgs, RunArgs};
+pub use cli::{Cli, Command, CompareArgs, ReplayArgs, ReportArgs, RunArgs};
+pub use compare::{Comparison, Source, Sources, TaskComparison, compare};
+pub use paired::Counts;
+pub use planning::{Planning, Solver};
 pub use record::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
 pub use replay::{Difference, Replay, replay};
 pub use summary::{Row, Summary, Training};
-pub use table::table;
+pub use table::{comparison_table, table};
 
 use anyhow::{Context, bail, ensure};
+use control::Control;
 use link::Link;
 use record::FIRST_EVALUATION_SEED;
 use service_kit::session::Connection;
@@ -56,9 +66,10 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
         let distinct: BTreeSet<_> = names.iter().collect();
         ensure!(distinct.len() == names.len(), "{option}: expected every name once, got {}", names.join(","));
     }
+    args.planning.check().context("--solver, --updates, --samples")?;
     let folder = Folder::new(&args.out);
     let _keeper = folder.take_over()?;
-    folder.check_goal(args.goal)?;
+    folder.check_settings(args.goal, &args.planning)?;
 
     let patience = Duration::from_secs(args.wait_secs);
     let timeout = Duration::from_secs(args.timeout_secs);
@@ -79,7 +90,9 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
         trials: args.trials,
         first_seed: args.first_seed,
         goal: args.goal,
+        planning: args.planning,
     };
+    check_planning(&run)?;
     if run.has_demonstration_seeds() {
         tracing::warn!(
             "--first-seed: seeds below {FIRST_EVALUATION_SEED} are those of demonstrations, which models may have been \
@@ -140,9 +153,10 @@ async fn models(
         }
         let served_by_one =
             |name: &String| served.iter().any(|(_, models)| models.iter().any(|model| model.name == *name));
+        let may_come = |name: &String| served_by_one(name) != Control::named(name).is_some();
         match same_models(&served, names) {
             Ok(models) => return Ok(models),
-            Err(error) if start.elapsed() >= patience || !names.iter().all(served_by_one) => return Err(error),
+            Err(error) if start.elapsed() >= patience || !names.iter().all(may_come) => return Err(error),
             Err(error) => tracing::info!("waiting up to {} s: {error:#}", patience.as_secs()),
         }
         tokio::time::sleep(MODELS_PERIOD).await;
@@ -151,6 +165,14 @@ async fn models(
 
 fn same_models(served: &[(&str, Vec<ModelInfo>)], names: &[String]) -> anyhow::Result<Vec<Model>> {
     let Some(((first, first_models), others)) = served.split_first() else { return Ok(Vec::new()) };
+    for (planner, models) in served {
+        let taken = models.iter().find(|model| names.contains(&model.name) && Control::named(&model.name).is_some());
+        if let Some(ModelInfo { name, .. }) = taken {
+            bail!(
+                "--models: expected {name} to be the control only, got a model of that name from planner \"{planner}\""
+            );
+        }
+    }
     let models = selected(first, first_models, names)?;
     for (planner, other_models) in others {
         check_same(first, &models, planner, other_models)?;
@@ -165,6 +187,9 @@ fn selected(planner: &str, served: &[ModelInfo], names: &[String]) -> anyhow::Re
         return Ok(served.iter().cloned().map(Model::from).collect());
     }
     let find = |name: &String| {
+        if let Some(control) = Control::named(name) {
+            return Ok(control.model());
+        }
         let model = served.iter().find(|model| model.name == *name).cloned().map(Model::from);
         model.with_context(|| format!("--models: planner \"{planner}\" serves {}; got {name}", listed(served)))
     };
@@ -173,7 +198,7 @@ fn selected(planner: &str, served: &[ModelInfo], names: &[String]) -> anyhow::Re
 
 /// Checks that a planner serves the models as the first one does.
 fn check_same(first: &str, expected: &[Model], planner: &str, served: &[ModelInfo]) -> anyhow::Result<()> {
-    for Model { name, digest, .. } in expected {
+    for Model { name, digest, .. } in expected.iter().filter(|model| Control::of(model).is_none()) {
         let Some(got) = served.iter().find(|model| model.name == *name) else {
             bail!(
                 "--planner: expected planner \"{planner}\" to serve {name} as planner \"{first}\" does, got {}",
@@ -186,6 +211,19 @@ fn check_same(first: &str, expected: &[Model], planner: &str, served: &[ModelInf
              got {}",
             got.digest
         );
+    }
+    Ok(())
+}
+
+/// Checks that what is asked for of plans suits the models.
+fn check_planning(Run { models, planning, .. }: &Run) -> anyhow::Result<()> {
+    let listed = || models.iter().map(|model| model.name.as_str()).collect::<Vec<_>>().join(", ");
+    let asked = planning.search().is_some() || planning.warm_start;
+    ensure!(!asked || models.iter().any(Model::plans), "{planning}: expected a model that plans, got {}", listed());
+    // The controls plan an action at a time.
+    let short = models.iter().find(|model| !model.is_control() && model.horizon < planning.apply_actions);
+    if let Some(Model { name, horizon, .. }) = short {
+        bail!("--apply-actions: expected at most {horizon}, the horizon of {name}, got {}", planning.apply_actions);
     }
     Ok(())
 }

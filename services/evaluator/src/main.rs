@@ -1,4 +1,4 @@
-//! `cpn-eval`: measures first-attempt success, reports it, and replays its episodes.
+//! `cpn-eval`: measures first-attempt success, reports it, compares models, and replays episodes.
 
 use anyhow::Context;
 use evaluator::{Cli, Command, Summary};
@@ -14,6 +14,15 @@ async fn program() -> anyhow::Result<ExitCode> {
     match service_kit::config::parse::<Cli>().command {
         Command::Run(args) => tell(&evaluator::run(&args).await?, args.json),
         Command::Report(args) => tell(&evaluator::report(&args.out)?, args.json),
+        Command::Compare(args) => {
+            let comparison = evaluator::compare(&args.a.0, &args.b.0)?;
+            output::print_line(if args.json {
+                serde_json::to_string_pretty(&comparison).context("printing the comparison")?
+            } else {
+                evaluator::comparison_table(&comparison)
+            })?;
+            Ok(ExitCode::SUCCESS)
+        }
         Command::Replay(args) => {
             let replay = evaluator::replay(&args).await?;
             output::print_line(&replay)?;

@@ -135,6 +135,7 @@ impl Queue {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
+    use crate::planning::Planning;
     use crate::record::{FORMAT, GoalSource, Model};
 
     fn variation(task: &str, seed: u64) -> Variation {
@@ -160,6 +161,7 @@ mod tests {
             trials,
             first_seed: 10,
             goal: GoalSource::SameVariation,
+            planning: Planning::default(),
         }
     }
 

@@ -1,5 +1,7 @@
 //! What a run leaves in its folder: one file that describes it, and one for each trial.
 
+use crate::control::Control;
+use crate::planning::Planning;
 use anyhow::{Context, ensure};
 use recording::plans::{self, Plans};
 use serde::de::DeserializeOwned;
@@ -40,6 +42,9 @@ pub struct Run {
     pub first_seed: u64,
     /// Where the goals come from.
     pub goal: GoalSource,
+    /// How plans are searched for and carried out.
+    #[serde(default, skip_serializing_if = "Planning::is_default")]
+    pub planning: Planning,
 }
 
 impl Run {
@@ -78,14 +83,26 @@ pub enum GoalSource {
 pub struct Model {
     /// Name it is served under.
     pub name: String,
-    /// `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    /// `random`, `bc`, `te-bc`, `upn` or `cpn`; `no-op` or `oracle` for a control of the evaluator's own.
     pub method: String,
-    /// SHA-256 of its checkpoint, in hex.
+    /// SHA-256 of its checkpoint, in hex; empty for a control of the evaluator's own.
     pub digest: String,
     /// Tasks it was trained on.
     pub training_tasks: Vec<String>,
     /// Number of actions in a plan.
     pub horizon: u32,
+}
+
+impl Model {
+    /// Whether its actions come from a search, which a request may choose.
+    pub(crate) fn plans(&self) -> bool {
+        matches!(self.method.as_str(), "upn" | "cpn")
+    }
+
+    /// Whether it stands beside the trained models as a control.
+    pub(crate) fn is_control(&self) -> bool {
+        self.method == "random" || Control::of(self).is_some()
+    }
 }
 
 impl From<ModelInfo> for Model {
@@ -110,10 +127,13 @@ pub struct Trial {
     pub model_digest: String,
     /// Where the goal came from.
     pub goal: GoalSource,
+    /// How plans were searched for and carried out.
+    #[serde(default, skip_serializing_if = "Planning::is_default")]
+    pub planning: Planning,
     /// How it ended.
     #[serde(flatten)]
     pub outcome: Outcome,
-    /// What happened until then; none after an error.
+    /// What happened until then; none if there was no attempt, and after an error.
     pub episode: Option<Episode>,
 }
 
@@ -125,6 +145,9 @@ pub enum Outcome {
     Success,
     /// The steps ran out.
     Failure,
+    /// The task was solved before any action, so that nothing was attempted.
+    #[serde(rename = "solved-at-reset")]
+    SolvedAtReset,
     /// The trial was not brought to an end, which says nothing about the model.
     Error {
         /// What went wrong.
@@ -135,11 +158,18 @@ pub enum Outcome {
 /// The course of an episode. A number that is not finite is recorded as none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Episode {
-    /// Id under which the planner knew the goal image.
+    /// Id of the goal: SHA-256 of the image or position, in hex.
     pub goal_id: String,
     /// Actions applied.
     pub steps: u32,
-    /// Distance between the embeddings of observation and goal before each step; empty for a method without embedding.
+    /// Progress towards success before the first step and after each, 0 to 1, as the simulator measures it; empty in records
+    /// from before it was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub progress: Vec<f64>,
+    /// Steps before each plan; empty if there was a plan before every step, or none at all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub plan_steps: Vec<u32>,
+    /// Distance between the embeddings of observation and goal at each plan; empty for a method without embedding.
     pub latent_distances: Vec<Option<f32>>,
     /// Inner loss before each update and after the last, of the first plan.
     pub first_inner_losses: Vec<Option<f32>>,
@@ -158,6 +188,13 @@ pub struct StageTimes {
     pub encode_seconds: f64,
     /// Planning.
     pub plan_seconds: f64,
+}
+
+impl Episode {
+    /// The step before which each plan was asked for.
+    pub(crate) fn plan_step(&self, plan: usize) -> u32 {
+        self.plan_steps.get(plan).copied().unwrap_or(plan as u32)
+    }
 }
 
 /// The folder of a run.
@@ -191,14 +228,16 @@ impl Folder {
         write_json(&self.path("run.json"), run)
     }
 
-    /// Checks that the folder is free for a run whose goals come from `goal`: trials lie in it by model and variation, so
-    /// that those of an ablation would take the place of the others.
-    pub(crate) fn check_goal(&self, goal: GoalSource) -> anyhow::Result<()> {
+    /// Checks that the folder is free for a run with such goals and plans: trials lie in it by model and variation, so that
+    /// those with others would take their place.
+    pub(crate) fn check_settings(&self, goal: GoalSource, planning: &Planning) -> anyhow::Result<()> {
         if self.path("run.json").exists() {
-            let got = self.read_run()?.goal;
+            let got = self.read_run()?;
             let folder = self.root.display();
-            let (expected, found) = (serde_json::to_string(&goal)?, serde_json::to_string(&got)?);
-            ensure!(got == goal, "--out: expected a folder of --goal {expected}, got {folder} of {found}");
+            let (expected, found) = (serde_json::to_string(&goal)?, serde_json::to_string(&got.goal)?);
+            ensure!(got.goal == goal, "--out: expected a folder of --goal {expected}, got {folder} of {found}");
+            let found = got.planning;
+            ensure!(found == *planning, "--out: expected a folder of {planning}, got {folder} of {found}");
         }
         Ok(())
     }
@@ -251,7 +290,7 @@ impl Folder {
                 let seeds = self.seeds(task, &model.name)?;
                 for seed in seeds.range(run.first_seed..).filter(|seed| !skipped.contains(seed)) {
                     let Some(trial) = self.read_trial(task, &model.name, *seed)? else { continue };
-                    if trial.model_digest == model.digest && trial.goal == run.goal {
+                    if trial.model_digest == model.digest && trial.goal == run.goal && trial.planning == run.planning {
                         by_seed.entry(*seed).or_default().push(trial);
                     }
                 }

@@ -17,6 +17,8 @@ const TEMPLATE: &str = include_str!("../templates/report.html");
 
 /// Colours for so many models are told apart; then they begin anew.
 const COLOURS: usize = 6;
+/// The same of controls.
+const GREYS: usize = 3;
 
 /// What the template is given.
 #[derive(Debug, Serialize)]
@@ -24,12 +26,16 @@ struct Page<'a> {
     run: &'a Run,
     confidence: String,
     interval_method: &'a str,
+    /// How plans were searched for and carried out.
+    planning: String,
+    solved_at_reset: usize,
     errors: usize,
     /// Remark on seeds of demonstrations; empty for others.
     seeds_warning: &'a str,
     legend: Vec<LegendEntry<'a>>,
     /// Each task with its seeds.
     seeds: Vec<(&'a str, String)>,
+    seeds_digest: &'a str,
     chart: BarChart,
     /// The rows of each task.
     tasks: Vec<&'a [TableRow<'a>]>,
@@ -69,6 +75,7 @@ struct Strip {
     goal: String,
     frames: Vec<Frame>,
     distance: Option<Line>,
+    progress: Option<Line>,
     first_inner_losses: Vec<Option<f32>>,
     last_inner_losses: Vec<Option<f32>>,
     /// Mean times in milliseconds.
@@ -104,10 +111,13 @@ pub(crate) fn html(summary: &Summary, trials: &[Trial], folder: &Folder) -> anyh
         run: &summary.run,
         confidence: format!("{:.0} %", 100.0 * summary.confidence),
         interval_method: summary.interval_method,
+        planning: summary.run.planning.to_string(),
+        solved_at_reset: summary.solved_at_reset(),
         errors: summary.errors(),
         seeds_warning: if summary.demonstration_seeds { DEMONSTRATION_SEEDS } else { "" },
         legend: (0..models).map(|index| legend_entry(&summary.run, index)).collect(),
-        seeds: summary.run.tasks.iter().map(|task| (task.as_str(), seeds(trials, task))).collect(),
+        seeds: summary.run.tasks.iter().map(|task| (task.as_str(), ranges(summary.seeds.get(task)))).collect(),
+        seeds_digest: &summary.seeds_digest,
         chart: BarChart::new(summary),
         tasks: rows.chunks(models).collect(),
         version: env!("CARGO_PKG_VERSION"),
@@ -130,13 +140,11 @@ fn legend_entry(run: &Run, index: usize) -> LegendEntry<'_> {
     }
 }
 
-/// Class of a model's colour: grey for random, else by its place among the others.
+/// Class of a model's colour: one of the greys for a control, else by its place among the others.
 fn colour(run: &Run, index: usize) -> String {
-    if run.models[index].method == "random" {
-        return "control".into();
-    }
-    let others = run.models[..index].iter().filter(|model| model.method != "random").count();
-    format!("c{}", others % COLOURS)
+    let is_control = run.models[index].is_control();
+    let before = run.models[..index].iter().filter(|model| model.is_control() == is_control).count();
+    if is_control { format!("g{}", before % GREYS) } else { format!("c{}", before % COLOURS) }
 }
 
 /// The filmstrip of the first trial with an outcome.
@@ -145,11 +153,15 @@ fn strip(trials: &[&Trial], outcome: &Outcome, folder: &Folder) -> anyhow::Resul
         let (Some(filmstrip), Some(episode)) = (filmstrip::read(folder, trial)?, &trial.episode) else { continue };
         let Filmstrip { goal, frames } = filmstrip;
         let ms = |seconds: f64| 1e3 * seconds;
+        let distances = episode.latent_distances.iter().enumerate();
+        let distances: Vec<_> = distances.map(|(plan, distance)| (episode.plan_step(plan), *distance)).collect();
+        let progress: Vec<_> = (0..).zip(episode.progress.iter().map(|value| Some(*value as f32))).collect();
         return Ok(Some(Strip {
             seed: trial.seed,
             steps: episode.steps,
             goal: STANDARD.encode(goal),
-            distance: Line::new(&episode.latent_distances, episode.steps, frames.len()),
+            distance: Line::new(&distances, episode.steps, frames.len()),
+            progress: Line::new(&progress, episode.steps, frames.len()),
             frames: frames.into_iter().map(|(step, png)| Frame { step, png: STANDARD.encode(png) }).collect(),
             first_inner_losses: episode.first_inner_losses.clone(),
             last_inner_losses: episode.last_inner_losses.clone(),
@@ -161,11 +173,10 @@ fn strip(trials: &[&Trial], outcome: &Outcome, folder: &Folder) -> anyhow::Resul
     Ok(None)
 }
 
-/// The seeds of a task's variations as ranges: `1000000–1000003, 1000005`.
-fn seeds(trials: &[Trial], task: &str) -> String {
-    let seeds: BTreeSet<u64> = trials.iter().filter(|trial| trial.task == task).map(|trial| trial.seed).collect();
+/// Seeds as ranges: `1000000–1000003, 1000005`.
+fn ranges(seeds: Option<&BTreeSet<u64>>) -> String {
     let mut ranges: Vec<(u64, u64)> = Vec::new();
-    for seed in seeds {
+    for &seed in seeds.into_iter().flatten() {
         match ranges.last_mut() {
             Some((_, last)) if *last + 1 == seed => *last = seed,
             _ => ranges.push((seed, seed)),

@@ -134,7 +134,7 @@ impl Schedule {
             let services = Services { planner, worker: worker.clone() };
             self.running.spawn(async move {
                 let model = &run.models[job.model];
-                let result = trial::attempt(&link, &services, model, &job.variation, run.goal).await;
+                let result = trial::attempt(&link, &services, model, &job.variation, &run).await;
                 if matches!(result, Err(Fault::Outage { .. } | Fault::Broken { .. })) {
                     tokio::time::sleep(PAUSE).await;
                 }
@@ -150,7 +150,7 @@ impl Schedule {
         match &result {
             Ok(_) => self.planners.clear(&planner),
             Err(Fault::Outage { by, .. } | Fault::Broken { by, .. }) => self.planners.suspect(by),
-            Err(Fault::NoGoalImage | Fault::Refused(_)) => (),
+            Err(Fault::NoGoalImage | Fault::SolvedAtReset | Fault::Refused(_)) => (),
         }
 
         let model = &self.run.models[job.model].name;
@@ -159,10 +159,16 @@ impl Schedule {
             _ if self.queue.is_skipped(&job.variation) => (),
             Ok(attempt) => {
                 // Before the record, which says that the trial is finished.
-                self.folder.write_plans(&attempt.plans)?;
+                if let Some(plans) = &attempt.plans {
+                    self.folder.write_plans(plans)?;
+                }
                 let trial = self.record(&job, attempt.outcome.clone(), Some(&attempt))?;
                 filmstrip::keep(&self.folder, &trial, &attempt.goal, &attempt.frames)?;
                 self.progress.count(job.model, attempt.outcome == Outcome::Success);
+            }
+            Err(Fault::SolvedAtReset) => {
+                self.progress.say(|| tracing::info!("{task} {seed}, {model}: solved at reset, which is no attempt"));
+                self.record(&job, Outcome::SolvedAtReset, None)?;
             }
             Err(Fault::NoGoalImage) => {
                 self.progress.say(|| tracing::info!("{task} {seed}: skipped, the expert does not solve it"));
@@ -206,6 +212,7 @@ impl Schedule {
             model: model.name.clone(),
             model_digest: model.digest.clone(),
             goal: self.run.goal,
+            planning: self.run.planning,
             outcome,
             episode: attempt.map(|attempt| attempt.episode.clone()),
         };

@@ -1,15 +1,15 @@
 //! One first attempt: closes the loop between a simulator worker and the planner.
 
+use crate::actor::{self, Actor};
+use crate::control::Control;
 use crate::link::{Link, is_outage};
 use crate::presence::Service;
 use crate::record::{self, GoalSource, Model, Outcome, Run, StageTimes};
 use anyhow::bail;
-use recording::plans::{Exchange, Plans};
-use std::time::Instant;
-use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
-use wire::replay::PlannedEpisode;
+use recording::plans::Plans;
+use wire::planner::PlanResponse;
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
-use wire::{Code, Error, Image, Observation, key};
+use wire::{Code, Error, Image, key};
 
 /// Variations that are tried for the goal of an ablation.
 const GOAL_TRIES: u32 = 10;
@@ -32,8 +32,8 @@ pub(crate) struct Attempt {
     pub(crate) goal: Image,
     /// Every frame from the first on, one more than steps.
     pub(crate) frames: Vec<Image>,
-    /// What the planner was asked, and its answers.
-    pub(crate) plans: Plans,
+    /// What the planner was asked, and its answers; none of a control.
+    pub(crate) plans: Option<Plans>,
 }
 
 /// Why an attempt came to no end.
@@ -41,6 +41,8 @@ pub(crate) struct Attempt {
 pub(crate) enum Fault {
     /// The expert does not solve the variation, hence there is no goal image: nobody can be evaluated on it.
     NoGoalImage,
+    /// The task is solved before any action: nothing is left to attempt.
+    SolvedAtReset,
     /// A request that is wrong and will stay wrong.
     Refused(Error),
     /// A router or a service was away for too long, or is another one since. A trial that begins anew will fare better.
@@ -60,7 +62,7 @@ pub(crate) enum Fault {
 }
 
 impl Fault {
-    fn new(by: Service, error: Error) -> Self {
+    pub(crate) fn new(by: Service, error: Error) -> Self {
         match (error.code, error.field.as_str()) {
             (Code::FailedPrecondition, "variation.seed" | "goal_seed") => Self::NoGoalImage,
             // A worker without the task's simulator; pictures of two renderings.
@@ -90,7 +92,7 @@ pub(crate) async fn check(
     for seed in *seed..seed.saturating_add(GOAL_TRIES.into()) {
         let variation = Variation { task: task.clone(), seed };
         match check_variation(link, services, run, &variation).await {
-            Err((_, Fault::NoGoalImage)) => (),
+            Err((_, Fault::NoGoalImage | Fault::SolvedAtReset)) => (),
             Err((by, Fault::Refused(error))) => bail!("{task} {seed}, {by}: refused: {error}"),
             Err((by, Fault::Outage { error, .. } | Fault::Broken { error, .. })) => {
                 tracing::debug!("{task} {seed}, {by}: not checked: {error}");
@@ -112,72 +114,65 @@ async fn check_variation(
     let (planner, worker) = (Service::Planner(planner.clone()), Service::Worker(worker.clone()));
     let by_worker = |error| (worker.to_string(), Fault::new(worker.clone(), error));
     let reset = link.reset(&worker, variation, run.goal).await.map_err(by_worker)?;
-    for model in &run.models {
+    for model in run.models.iter().filter(|model| Control::of(model).is_none()) {
         let by_planner = |error| (model.name.clone(), Fault::new(planner.clone(), error));
         let goal = link.goal(&planner, &reset).await.map_err(by_planner)?;
-        let observation = reset.hand_position.map_or_else(|| reset.observation.clone().into(), Observation::from);
-        let request = link.plan_request(model, goal, observation, plan_seed(variation.seed, 0));
+        let observation = actor::observed(&reset, &reset.observation, reset.hand_position);
+        let request = link.plan_request(model, &run.planning, goal, observation, actor::plan_seed(variation.seed, 0));
         link.plan(&planner, request).await.map_err(by_planner)?;
     }
     Ok(())
 }
 
-/// Runs one episode: plans anew at each step and applies the first action (model predictive control). Where the goal is a
+/// Runs one episode: plans, applies the first actions of the plan and plans anew (model predictive control). Where the goal is a
 /// position, the model is told that and where the hand is, and no picture.
 pub(crate) async fn attempt(
     link: &Link,
     Services { planner, worker }: &Services,
     model: &Model,
     variation: &Variation,
-    goal: GoalSource,
+    run: &Run,
 ) -> Result<Attempt, Fault> {
-    let (planner, worker) = (Service::Planner(planner.clone()), Service::Worker(worker.clone()));
-    let by_planner = |error| Fault::new(planner.clone(), error);
+    let worker = Service::Worker(worker.clone());
     let by_worker = |error| Fault::new(worker.clone(), error);
-    let reset = link.reset(&worker, variation, goal).await.map_err(by_worker)?;
-    let start = Instant::now();
-    let goal = link.goal(&planner, &reset).await.map_err(by_planner)?;
+    let reset = link.reset(&worker, variation, run.goal).await.map_err(by_worker)?;
+    if reset.success {
+        return Err(Fault::SolvedAtReset);
+    }
+    let planner = Service::Planner(planner.clone());
+    let mut actor = Actor::new(link, planner, model, &run.planning, variation.seed, &reset).await?;
+
     let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
-    let mut exchanges = Vec::new();
     let mut hand = reset.hand_position;
-    let mut frames = vec![reset.observation];
-    for step in 0..reset.max_steps {
-        let observation = hand.map_or_else(|| frames[frames.len() - 1].clone().into(), Observation::from);
-        let request = link.plan_request(model, goal.clone(), observation, plan_seed(variation.seed, step));
-        let asked = start.elapsed();
-        let mut plan = link.plan(&planner, request.clone()).await;
-        if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
-            // The planner was restarted, or has evicted the goal.
-            link.register_goal(&planner, &reset.goal).await.map_err(by_planner)?;
-            plan = link.plan(&planner, request.clone()).await;
+    let mut frames = vec![reset.observation.clone()];
+    let mut progress = vec![reset.progress];
+    let mut step = 0;
+    let mut held = vec![0.0; reset.control.action_size as usize];
+    while step < reset.max_steps {
+        let mut decided = actor.decide(&reset, step, &frames[frames.len() - 1], hand).await?;
+        if run.planning.real_time {
+            let steps = (decided.thinking_seconds * reset.control.hz).ceil().max(1.0) as usize;
+            let next = decided.actions.swap_remove(0);
+            decided.actions = vec![std::mem::replace(&mut held, next); steps.min(reset.max_steps as usize)];
         }
-        let response = plan.map_err(by_planner)?;
-        let action = response.first_action.clone();
-        exchanges.push(Exchange { request, asked, response, answered: start.elapsed() });
-        let request = StepRequest { episode_id: reset.episode_id.clone(), step, action };
-        let response: StepResponse = link.call(&worker, step_key.clone(), request).await.map_err(by_worker)?;
-        hand = response.hand_position;
-        frames.push(response.observation);
-        if response.done {
-            let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
-            let episode = PlannedEpisode {
-                variation: variation.clone(),
-                model: model.name.clone(),
-                model_digest: model.digest.clone(),
-                goal: reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from),
-                plans: step + 1,
-            };
-            let plans = Plans::new(episode, exchanges).map_err(by_planner)?;
-            return Ok(Attempt { outcome, episode: course(&plans), goal: reset.goal, frames, plans });
+
+        for action in decided.actions {
+            let request = StepRequest { episode_id: reset.episode_id.clone(), step, action };
+            let response: StepResponse = link.call(&worker, step_key.clone(), request).await.map_err(by_worker)?;
+            step += 1;
+            hand = response.hand_position;
+            frames.push(response.observation);
+            progress.push(response.progress);
+            if response.done {
+                let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
+                let (plans, plan_steps) = actor.end(variation, &reset)?;
+                let episode = record::Episode { steps: step, progress, plan_steps, ..course(&reset, plans.as_ref()) };
+                return Ok(Attempt { outcome, episode, goal: reset.goal, frames, plans });
+            }
         }
     }
     let expected = format!("true after {} steps", reset.max_steps);
     Err(by_worker(Error::new(Code::Internal, "done", expected, false)))
-}
-
-/// Seed of the plan before a step: no two steps of an evaluation share one.
-fn plan_seed(variation: u64, step: u32) -> u64 {
-    (variation << 16) + u64::from(step)
 }
 
 impl Link {
@@ -197,49 +192,23 @@ impl Link {
             }
         }
     }
-
-    /// The goal of an episode as the planner is told it: a position, or the id of a picture that it gets to know.
-    async fn goal(&self, planner: &Service, reset: &ResetResponse) -> Result<Goal, Error> {
-        Ok(match reset.goal_position {
-            Some(position) => Goal::Position(position),
-            None => Goal::Id(self.register_goal(planner, &reset.goal).await?),
-        })
-    }
-
-    fn plan_request(&self, model: &Model, goal: Goal, observation: Observation, seed: u64) -> PlanRequest {
-        PlanRequest {
-            seed,
-            deadline: Some(self.timeout),
-            // The one that the run began with, though the planner may swap.
-            model_digest: Some(model.digest.clone()),
-            ..PlanRequest::new(&model.name, goal, observation)
-        }
-    }
-
-    async fn plan(&self, planner: &Service, request: PlanRequest) -> Result<PlanResponse, Error> {
-        self.call(planner, key::planner_plan(planner.name())?, request).await
-    }
-
-    async fn register_goal(&self, planner: &Service, goal: &Image) -> Result<String, Error> {
-        let request = RegisterGoalRequest { image: goal.clone() };
-        let key = key::planner_register_goal(planner.name())?;
-        let response: RegisterGoalResponse = self.call(planner, key, request).await?;
-        Ok(response.goal_id)
-    }
 }
 
-/// What the plans of an episode tell about themselves.
-fn course(plans: &Plans) -> record::Episode {
-    let plans: Vec<_> = plans.exchanges().iter().map(|exchange| &exchange.response).collect();
+/// What the plans of an episode, if there are any, tell about themselves.
+fn course(reset: &ResetResponse, plans: Option<&Plans>) -> record::Episode {
+    let plans: Vec<_> = plans.iter().flat_map(|plans| plans.exchanges()).map(|exchange| &exchange.response).collect();
     let finite = |value: f32| value.is_finite().then_some(value);
     let inner_losses = |plan: Option<&&PlanResponse>| {
         plan.iter().flat_map(|plan| &plan.inner_losses).map(|&loss| finite(loss)).collect()
     };
-    let mean =
-        |seconds: fn(&PlanResponse) -> f64| plans.iter().map(|plan| seconds(plan)).sum::<f64>() / plans.len() as f64;
+    let mean = |seconds: fn(&PlanResponse) -> f64| {
+        plans.iter().map(|plan| seconds(plan)).sum::<f64>() / plans.len().max(1) as f64
+    };
     record::Episode {
-        goal_id: plans.last().map(|plan| plan.goal_id.clone()).unwrap_or_default(),
-        steps: plans.len() as u32,
+        goal_id: actor::goal(reset).digest(),
+        steps: 0,
+        progress: Vec::new(),
+        plan_steps: Vec::new(),
         latent_distances: plans.iter().filter_map(|plan| plan.latent_distance).map(finite).collect(),
         first_inner_losses: inner_losses(plans.first()),
         last_inner_losses: inner_losses(plans.last()),
@@ -255,13 +224,15 @@ fn course(plans: &Plans) -> record::Episode {
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
+    use crate::planning::Planning;
     use crate::presence::Alive;
     use service_kit::SessionConfig;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::time::Duration;
     use tokio::sync::watch;
-    use wire::query;
+    use wire::planner::{PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
+    use wire::{Position, query, sim};
     use zenoh::Session;
     use zenoh::key_expr::OwnedKeyExpr;
     use zenoh::query::Query;
@@ -270,6 +241,10 @@ mod tests {
 
     fn image(shade: u8) -> Image {
         Image::new(2, 2, vec![shade; 12]).unwrap()
+    }
+
+    fn at(x: f32) -> Position {
+        Position::new([x, 0.0, 0.0]).unwrap()
     }
 
     async fn serve(session: &Session, key: OwnedKeyExpr, answer: impl Fn(&Query) + Send + Sync + 'static) {
@@ -291,18 +266,29 @@ mod tests {
                     observation: image(0),
                     max_steps: 5,
                     goal_position: None,
-                    hand_position: None,
+                    hand_position: at(0.0),
+                    goal_hand_position: at(0.1),
+                    success: variation.seed == 50,
+                    progress: 0.0,
+                    control: sim::Control { action_size: 4, metres: 0.01, hz: 10.0 },
                 }),
             };
             query::reply(query, result).unwrap();
         })
         .await;
         serve(&session, key::sim_step("w").unwrap(), |query| {
-            let step = query::request::<StepRequest>(query).unwrap().step;
+            let StepRequest { step, action, .. } = query::request(query).unwrap();
             let solved = step == 2;
-            let observation = image(step as u8 + 1);
-            let (reward, success, done, hand_position) = (0.0, solved, solved, None);
-            query::reply(query, Ok(StepResponse { observation, reward, success, done, hand_position })).unwrap();
+            let response = StepResponse {
+                observation: image(step as u8 + 1),
+                reward: 0.0,
+                success: solved,
+                done: solved,
+                hand_position: at(0.01 * (step + 1) as f32),
+                // Tells which action came.
+                progress: f64::from(action[0]),
+            };
+            query::reply(query, Ok(response)).unwrap();
         })
         .await;
         let registered = Arc::new(AtomicUsize::new(0));
@@ -321,17 +307,20 @@ mod tests {
             } else if count.load(Ordering::SeqCst) < 2 {
                 Err(Error::new(Code::NotFound, "goal_id", "a goal", "forgotten"))
             } else {
+                // Begins where it was told to, else at the seed; rises by a tenth at each action, beyond what can be applied.
+                let first = request.warm_start.first().map_or((request.seed % 8) as f32 / 4.0, |start| start[0]);
+                let actions: Vec<_> = (0..3u8).map(|k| vec![first + 0.1 * f32::from(k); 4]).collect();
                 Ok(PlanResponse {
-                    actions: vec![vec![0.0; 4]],
-                    first_action: vec![0.0; 4],
+                    first_action: vec![first.min(1.0); 4],
+                    warm_start: actions[1..].iter().chain(&actions[2..]).cloned().collect(),
+                    actions,
                     inner_losses: vec![f32::NAN, request.seed as f32],
                     latent_distance: Some(1.0),
                     times: wire::planner::StageTimes { plan_seconds: 0.5, ..Default::default() },
                     model_digest: DIGEST.into(),
                     goal_id: image(255).digest(),
                     iterations: 0,
-                    iterations_run: 0,
-                    warm_start: Vec::new(),
+                    iterations_run: request.search.map_or(0, |search| search.iterations.unwrap_or_default()),
                 })
             };
             query::reply(query, result).unwrap();
@@ -343,7 +332,27 @@ mod tests {
 
     fn model(digest: &str) -> Model {
         let (name, method, digest) = ("cpn".into(), "cpn".into(), digest.into());
-        Model { name, method, digest, training_tasks: Vec::new(), horizon: 1 }
+        Model { name, method, digest, training_tasks: Vec::new(), horizon: 3 }
+    }
+
+    fn run(goal: GoalSource, planning: Planning) -> Run {
+        Run {
+            format: record::FORMAT,
+            title: String::new(),
+            command: String::new(),
+            date: String::new(),
+            planners: Vec::new(),
+            models: Vec::new(),
+            tasks: Vec::new(),
+            trials: 1,
+            first_seed: 0,
+            goal,
+            planning,
+        }
+    }
+
+    fn default_run() -> Run {
+        run(GoalSource::SameVariation, Planning::default())
     }
 
     fn with(worker: &str) -> Services {
@@ -357,14 +366,14 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn a_forgotten_goal_is_registered_again_and_the_episode_recorded() {
         let (link, registered) = forgetful().await;
-        let goal = GoalSource::SameVariation;
-        let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), goal).await.unwrap();
+        let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &default_run()).await.unwrap();
         assert_eq!(registered.load(Ordering::SeqCst), 2);
         assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
-        let plans = attempt.plans;
+        let plans = attempt.plans.unwrap();
         assert_eq!((plans.exchanges().len(), &plans.episode().goal), (3, &image(255).into()));
         let episode = attempt.episode;
         assert_eq!((episode.steps, episode.latent_distances), (3, vec![Some(1.0); 3]));
+        assert_eq!((episode.progress, episode.plan_steps), (vec![0.0, 0.0, 0.25, 0.5], vec![]));
         let seeds = [1 << 16, (1 << 16) + 2].map(|seed| seed as f32);
         assert_eq!(episode.first_inner_losses, [None, Some(seeds[0])]);
         assert_eq!(episode.last_inner_losses, [None, Some(seeds[1])]);
@@ -375,14 +384,14 @@ mod tests {
     async fn faults_are_told_apart() {
         let (link, _) = forgetful().await;
         let fault = async |worker: &str, digest: &str, variation: Variation| {
-            attempt(&link, &with(worker), &model(digest), &variation, GoalSource::SameVariation).await.unwrap_err()
+            attempt(&link, &with(worker), &model(digest), &variation, &default_run()).await.unwrap_err()
         };
         // The expert solves none of the variations whose goal could be shown.
-        let goal = GoalSource::OtherVariation;
-        let other = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 99), goal).await;
+        let ablation = run(GoalSource::OtherVariation, Planning::default());
+        let other = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 99), &ablation).await;
         assert!(matches!(other, Err(Fault::NoGoalImage)));
         // It solves seed 12, not 13, and the one after, whose goal is shown instead.
-        attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 12), goal).await.unwrap();
+        attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 12), &ablation).await.unwrap();
         assert!(matches!(fault("w", DIGEST, variation("reach", 13)).await, Fault::NoGoalImage));
         assert!(
             matches!(fault("w", DIGEST, variation("unknown", 1)).await, Fault::Refused(e) if e.field == "variation.task")
@@ -400,5 +409,49 @@ mod tests {
         let of_worker = |code, field: &str| Fault::new(Service::Worker("w".into()), Error::new(code, field, "", ""));
         assert!(matches!(of_worker(Code::NotFound, "episode_id"), Fault::Outage { .. }));
         assert!(matches!(of_worker(Code::Internal, ""), Fault::Broken { .. }));
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn plans_are_searched_for_and_carried_out_as_set() {
+        let (link, _) = forgetful().await;
+        let planned = async |planning: Planning| {
+            let run = run(GoalSource::SameVariation, planning);
+            let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &run).await.unwrap();
+            let tenths = |value: &f64| (10.0 * value).round() as i32;
+            let applied: Vec<_> = attempt.episode.progress[1..].iter().map(tenths).collect();
+            (applied, attempt.episode.plan_steps, attempt.plans.unwrap())
+        };
+        let default = Planning::default();
+        let (applied, _, plans) = planned(Planning { updates: Some(20), ..default }).await;
+        assert_eq!(applied, [0, 3, 5]);
+        assert!(plans.exchanges().iter().all(|exchange| exchange.response.iterations_run == 20));
+        // Each plan begins one action further on.
+        let (applied, steps, plans) = planned(Planning { warm_start: true, ..default }).await;
+        assert_eq!((applied, steps), (vec![0, 1, 2], vec![]));
+        assert!(plans.exchanges().iter().all(|exchange| exchange.request.search.is_none()));
+        // Two actions of the first plan, then the second plan, from the third action on.
+        let (applied, steps, plans) = planned(Planning { apply_actions: 2, warm_start: true, ..default }).await;
+        assert_eq!((applied, steps, plans.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));
+        let tenths = |action: &Vec<f32>| (10.0 * action[0]).round() as i32;
+        assert_eq!(plans.exchanges()[1].request.warm_start.iter().map(tenths).collect::<Vec<_>>(), [2, 2, 2]);
+        // A plan takes half a second here, five steps of the simulation: none acts before the episode ends.
+        let (applied, steps, plans) = planned(Planning { real_time: true, ..default }).await;
+        assert_eq!((applied, steps, plans.exchanges().len()), (vec![0, 0, 0], vec![], 1));
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn controls_ask_no_planner_and_solved_variations_are_not_attempted() {
+        let (link, registered) = forgetful().await;
+        let services = Services { planner: "nobody".into(), worker: "w".into() };
+        for (control, applied) in [(Control::NoOp, [0.0; 3]), (Control::Oracle, [1.0; 3])] {
+            let attempt =
+                attempt(&link, &services, &control.model(), &variation("reach", 1), &default_run()).await.unwrap();
+            assert_eq!((attempt.plans, attempt.episode.steps), (None, 3));
+            assert_eq!(attempt.episode.progress[1..], applied);
+            assert_eq!(attempt.episode.goal_id, image(255).digest());
+        }
+        let solved = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 50), &default_run()).await;
+        assert!(matches!(solved, Err(Fault::SolvedAtReset)));
+        assert_eq!(registered.load(Ordering::SeqCst), 0);
     }
 }

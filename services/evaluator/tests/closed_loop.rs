@@ -113,6 +113,87 @@ async fn every_model_is_run_on_the_same_variations_and_reported() {
     lab.stop_planner().await;
 }
 
+/// Rest solves nothing, the straight line reaches; and plans are asked for and carried out as they are set.
+#[tokio::test(flavor = "multi_thread")]
+async fn controls_stand_beside_models_whose_plans_are_set() {
+    let mut lab = Lab::start(0).await;
+    let _worker = worker(&lab, "w0", 60);
+    let arguments = ["--tasks", "reach", "--models", "no-op,oracle,cpn", "--trials", "1", "--wait-secs", "120"];
+    let planning = ["--updates", "2", "--warm-start", "--apply-actions", "2"];
+    let ended = lab.evaluate(&[&arguments[..], &planning].concat()).await;
+    assert!(ended.success);
+    assert!(ended.stdout.contains("plans: --updates 2 --warm-start --apply-actions 2"));
+
+    let [rest, line, cpn] =
+        ["no-op", "oracle", "cpn"].map(|model| record(&lab.out(), &format!("reach/{model}/1000000.json")));
+    assert_eq!((&rest["outcome"], &rest["episode"]["steps"]), (&"failure".into(), &60.into()));
+    assert_eq!((&line["outcome"], &line["model_digest"]), (&"success".into(), &"".into()));
+    assert_eq!(rest["episode"]["goal_id"], cpn["episode"]["goal_id"]);
+    let progress = |record: &serde_json::Value| {
+        record["episode"]["progress"].as_array().unwrap().iter().map(|it| it.as_f64().unwrap()).collect::<Vec<_>>()
+    };
+    let (rest, line, steps) = (progress(&rest), progress(&line), line["episode"]["steps"].as_u64().unwrap());
+    assert_eq!((rest.len(), line.len() as u64), (61, steps + 1));
+    assert!((rest[0] - line[0]).abs() < 1e-12 && rest[60] < rest[0] + 0.01 && line[line.len() - 1] > 0.9);
+    assert!(!lab.out().join("trials/reach/oracle/1000000.mcap").exists(), "no planner was asked");
+
+    assert_eq!(cpn["planning"]["updates"], 2);
+    let episode = &cpn["episode"];
+    assert_eq!(
+        episode["plan_steps"].as_array().unwrap().iter().map(|it| it.as_u64().unwrap()).collect::<Vec<_>>(),
+        (0..30).map(|plan| 2 * plan).collect::<Vec<_>>()
+    );
+    assert_eq!(episode["last_inner_losses"].as_array().unwrap().len(), 3, "before each update and after the last");
+    let file = lab.out().join("trials/reach/cpn/1000000.mcap");
+    let plans = recording::plans::read(&file).unwrap();
+    let starts: Vec<_> = plans.exchanges().iter().map(|exchange| &exchange.request.warm_start).collect();
+    assert!(starts[0].is_empty());
+    assert_eq!(starts[1][0], plans.exchanges()[0].response.actions[2], "two actions further on");
+    let replayed = lab.replay(&file).await;
+    assert_eq!((replayed.success, replayed.stdout.as_str()), (true, "30 plans: bit for bit the same\n"));
+
+    let refused = async |arguments: &[&str], refusal: &str| {
+        let ended = lab.evaluate(&[&["--tasks", "reach", "--trials", "1"], arguments].concat()).await;
+        assert!(!ended.success && ended.stderr.contains(refusal), "{}", ended.stderr);
+    };
+    let cpn = ["--models", "cpn"];
+    refused(&[&cpn[..], &["--updates", "3"]].concat(), "--out: expected a folder of --updates 3, got ").await;
+    std::fs::remove_dir_all(lab.out()).unwrap();
+    let refusal = "--apply-actions: expected at most 5, the horizon of cpn, got 9";
+    refused(&[&cpn[..], &["--apply-actions", "9"]].concat(), refusal).await;
+    let refusal = "--updates 3: expected a model that plans, got no-op";
+    refused(&["--models", "no-op", "--updates", "3"], refusal).await;
+    let refusal = "samples: expected none for GRADIENT, got 9";
+    refused(&["--solver", "gradient", "--samples", "9"], refusal).await;
+    lab.serve_as("oracle").await;
+    let refusal = "--models: expected oracle to be the control only, got a model of that name from planner \"planner\"";
+    refused(&["--models", "oracle"], refusal).await;
+    lab.stop_planner().await;
+}
+
+/// While a plan is made, the simulation goes on by at least one step.
+#[tokio::test(flavor = "multi_thread")]
+async fn in_real_time_the_first_plan_comes_too_late_for_the_first_step() {
+    let mut lab = Lab::start(0).await;
+    let _worker = worker(&lab, "w0", 12);
+    let arguments =
+        ["--tasks", "reach", "--models", "oracle,cpn", "--trials", "1", "--wait-secs", "120", "--real-time"];
+    assert!(lab.evaluate(&arguments).await.success);
+    let [line, cpn] = ["oracle", "cpn"].map(|model| record(&lab.out(), &format!("reach/{model}/1000000.json")));
+    assert_eq!((&line["planning"]["real_time"], &line["episode"]["steps"]), (&true.into(), &12.into()));
+    let plans = recording::plans::read(&lab.out().join("trials/reach/cpn/1000000.mcap")).unwrap();
+    let late = |times: wire::planner::StageTimes| {
+        let seconds = times.queue_seconds + times.encode_seconds + times.plan_seconds;
+        (80.0 * seconds).ceil().max(1.0) as u64
+    };
+    let waits: Vec<_> = plans.exchanges().iter().map(|exchange| late(exchange.response.times)).collect();
+    let (last, before) = waits.split_last().unwrap();
+    let before: u64 = before.iter().sum();
+    assert!(before < 12 && before + last >= 12, "{waits:?}");
+    assert_eq!(cpn["episode"]["steps"], 12);
+    lab.stop_planner().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_worker_leaves_errors_and_no_hang() {
     lose(Lost::Worker).await;

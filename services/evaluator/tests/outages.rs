@@ -19,8 +19,8 @@ use std::time::Duration;
 use tokio::process::Command;
 use tokio::time::{sleep, timeout};
 use wire::planner::{CheckpointSource, LoadModelRequest, PlanRequest, PlanResponse};
-use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse};
-use wire::{Code, Error, Image, key, query};
+use wire::sim::{Control, ResetRequest, ResetResponse, StepRequest, StepResponse};
+use wire::{Code, Error, Image, Position, key, query};
 use zenoh::Session;
 use zenoh::query::Query;
 
@@ -65,12 +65,12 @@ struct Simulator {
     name: String,
     resets: usize,
     episode: Option<Episode>,
-    control: Arc<Control>,
+    levers: Arc<Levers>,
 }
 
 /// What a test sees and does of a simulator.
 #[derive(Default)]
-struct Control {
+struct Levers {
     /// Steps so far.
     applied: AtomicUsize,
     /// Whether the next step is not to come to its end.
@@ -96,6 +96,10 @@ fn picture(state: u64) -> Image {
     Image::new(84, 84, pixels).unwrap()
 }
 
+fn origin() -> Position {
+    Position::new([0.0; 3]).unwrap()
+}
+
 impl Simulator {
     fn reset(&mut self, ResetRequest { variation, .. }: ResetRequest) -> ResetResponse {
         self.resets += 1;
@@ -108,7 +112,11 @@ impl Simulator {
             observation: picture(state),
             max_steps: MAX_STEPS,
             goal_position: None,
-            hand_position: None,
+            hand_position: origin(),
+            goal_hand_position: origin(),
+            success: false,
+            progress: 0.0,
+            control: Control { action_size: 4, metres: 0.01, hz: 80.0 },
         }
     }
 
@@ -126,8 +134,8 @@ impl Simulator {
         }
         // Simulation takes time, in which things can happen.
         std::thread::sleep(Duration::from_millis(20));
-        while self.control.hold.load(Ordering::SeqCst) {
-            self.control.held.store(true, Ordering::SeqCst);
+        while self.levers.hold.load(Ordering::SeqCst) {
+            self.levers.held.store(true, Ordering::SeqCst);
             std::thread::sleep(Duration::from_millis(1));
         }
         episode.steps += 1;
@@ -138,16 +146,17 @@ impl Simulator {
             reward: 0.0,
             success,
             done: success || episode.steps == MAX_STEPS,
-            hand_position: None,
+            hand_position: origin(),
+            progress: f64::from((episode.state >> 48) as u16) / f64::from(u16::MAX),
         };
         episode.latest = Some((request, response.clone()));
-        self.control.applied.fetch_add(1, Ordering::SeqCst);
+        self.levers.applied.fetch_add(1, Ordering::SeqCst);
         Ok(response)
     }
 }
 
 /// A worker of the network: as it is started anew, it knows of no episode. Closing its session kills it.
-async fn worker(endpoint: &str, name: &str) -> (Session, Arc<Control>) {
+async fn worker(endpoint: &str, name: &str) -> (Session, Arc<Levers>) {
     enum Asked {
         Reset(Query),
         Step(Query),
@@ -159,8 +168,8 @@ async fn worker(endpoint: &str, name: &str) -> (Session, Arc<Control>) {
     queryable.callback(move |query| drop(resets.send(Asked::Reset(query)))).background().await.unwrap();
     let queryable = session.declare_queryable(key::sim_step(name).unwrap()).complete(true);
     queryable.callback(move |query| drop(sender.send(Asked::Step(query)))).background().await.unwrap();
-    let control = Arc::<Control>::default();
-    let mut simulator = Simulator { name: name.into(), resets: 0, episode: None, control: control.clone() };
+    let levers = Arc::<Levers>::default();
+    let mut simulator = Simulator { name: name.into(), resets: 0, episode: None, levers: levers.clone() };
     std::thread::spawn(move || {
         // An answer may find nobody: its router or its asker is away.
         for asked in receiver {
@@ -173,7 +182,7 @@ async fn worker(endpoint: &str, name: &str) -> (Session, Arc<Control>) {
     let token = session.liveliness().declare_token(key::sim_alive(name).unwrap()).await.unwrap();
     // It lives as long as the session.
     std::mem::forget(token);
-    (session, control)
+    (session, levers)
 }
 
 async fn wait_until(what: &str, condition: impl Fn() -> bool) {
@@ -186,7 +195,7 @@ async fn wait_until(what: &str, condition: impl Fn() -> bool) {
 }
 
 /// Waits until workers have applied ten more steps.
-async fn ten_steps(workers: &[&Control]) {
+async fn ten_steps(workers: &[&Levers]) {
     let count = || workers.iter().map(|worker| worker.applied.load(Ordering::SeqCst)).sum::<usize>();
     let enough = count() + 10;
     wait_until("the evaluation goes on", || count() >= enough).await;

@@ -10,7 +10,7 @@ use service_kit::SessionConfig;
 use std::path::PathBuf;
 use std::time::Duration;
 use wire::planner::{Search, Solver};
-use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse};
+use wire::sim::{Control, ResetRequest, ResetResponse, StepRequest, StepResponse};
 use wire::{Image, Position, key, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
@@ -25,8 +25,8 @@ fn picture(seed: u32) -> Image {
     Image::new(84, 84, pixels).unwrap()
 }
 
-fn hand(step: u32) -> Option<Position> {
-    Some(Position::new([0.5, 0.1 * step as f32, 0.2]).unwrap())
+fn hand(step: u32) -> Position {
+    Position::new([0.5, 0.1 * step as f32, 0.2]).unwrap()
 }
 
 /// A worker whose episodes show a picture after another; those of Jenga have a position as their goal.
@@ -46,19 +46,24 @@ async fn worker(lab: &Lab) -> Session {
             observation: picture(0),
             max_steps: STEPS,
             goal_position: is_position.then(|| Position::new([0.7, -0.1, 0.2]).unwrap()),
-            hand_position: is_position.then(|| hand(0)).flatten(),
+            hand_position: hand(0),
+            goal_hand_position: hand(STEPS),
+            success: false,
+            progress: 0.0,
+            control: Control { action_size: if is_position { 3 } else { 4 }, metres: 0.01, hz: 10.0 },
         };
         query::reply(query, Ok(response)).unwrap();
     })
     .await;
     serve(key::sim_step("w").unwrap(), |query| {
-        let StepRequest { episode_id, step, .. } = query::request(query).unwrap();
+        let StepRequest { step, .. } = query::request(query).unwrap();
         let response = StepResponse {
             observation: picture(step + 1),
             reward: 0.0,
             success: false,
             done: step + 1 == STEPS,
-            hand_position: episode_id.starts_with("jenga").then(|| hand(step + 1)).flatten(),
+            hand_position: hand(step + 1),
+            progress: 0.0,
         };
         query::reply(query, Ok(response)).unwrap();
     })

@@ -2,7 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
-use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Run, StageTimes, Trial};
+use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Planning, Run, StageTimes, Trial};
 
 /// Seeds below are those of demonstrations.
 const FIRST_SEED: u64 = 1_000_000;
@@ -29,6 +29,7 @@ fn run() -> Run {
         trials: 4,
         first_seed: FIRST_SEED + 10,
         goal: GoalSource::SameVariation,
+        planning: Planning::default(),
     }
 }
 
@@ -36,14 +37,16 @@ fn trial(task: &str, model: &Model, seed: u64, outcome: Outcome, steps: u32) -> 
     let episode = Episode {
         goal_id: "c".repeat(64),
         steps,
+        progress: [0.0, 0.5, 0.25].into(),
+        plan_steps: vec![],
         latent_distances: vec![Some(1.5); steps as usize],
         first_inner_losses: vec![Some(2.0), None],
         last_inner_losses: vec![],
         mean_times: StageTimes::default(),
     };
     let (task, model, model_digest) = (task.into(), model.name.clone(), model.digest.clone());
-    let (seed, goal) = (FIRST_SEED + seed, GoalSource::SameVariation);
-    Trial { format: FORMAT, task, seed, model, model_digest, goal, outcome, episode: Some(episode) }
+    let (seed, goal, planning) = (FIRST_SEED + seed, GoalSource::SameVariation, Planning::default());
+    Trial { format: FORMAT, task, seed, model, model_digest, goal, planning, outcome, episode: Some(episode) }
 }
 
 /// Seed 12 of door-lock has no goal image; one trial of drawer-close was never brought to an end.
@@ -72,14 +75,14 @@ fn the_table_has_a_row_for_each_task_and_model() {
     let (root, _) = folder();
     let summary = evaluator::report(root.path()).unwrap();
     insta::assert_snapshot!(evaluator::table(&summary), @r"
-    ──────────────────────────────────────────────────────────────────────────────────────
-     task           model    task was   successes   rate   95 % interval   steps   errors 
-    ══════════════════════════════════════════════════════════════════════════════════════
-     door-lock      cpn      held out         3/4   75 %      30 to 95 %      50        – 
-     door-lock      random   –                0/4    0 %       0 to 49 %       –        – 
-     drawer-close   cpn      trained          1/3   33 %       6 to 79 %      30        1 
-     drawer-close   random   –                1/4   25 %       5 to 70 %      30        – 
-    ──────────────────────────────────────────────────────────────────────────────────────
+    ──────────────────────────────────────────────────────────────────────────────────────────────────
+     task           model    task was   successes   rate   95 % interval   steps    progress   errors 
+    ══════════════════════════════════════════════════════════════════════════════════════════════════
+     door-lock      cpn      held out         3/4   75 %      30 to 95 %      50   0.50 0.25        – 
+     door-lock      random   –                0/4    0 %       0 to 49 %       –   0.50 0.25        – 
+     drawer-close   cpn      trained          1/3   33 %       6 to 79 %      30   0.50 0.25        1 
+     drawer-close   random   –                1/4   25 %       5 to 70 %      30   0.50 0.25        – 
+    ──────────────────────────────────────────────────────────────────────────────────────────────────
     drawer-close, cpn: 1 error: worker w0: step: expected <an answer>, got none
     ");
     assert_eq!(summary.errors(), 1);
@@ -108,6 +111,53 @@ fn an_ablation_of_the_goal_says_so_and_counts_no_other_trials() {
     assert!(evaluator::table(&summary).ends_with("ablation: the goal shows the end of another variation"));
     let html = std::fs::read_to_string(folder.path("report.html")).unwrap();
     assert!(html.contains("Ablation: the picture shows the end of another variation"));
+}
+
+/// A trial whose task was solved before any action is in no rate, and every list of seeds is told by its digest.
+#[test]
+fn what_was_solved_at_reset_is_counted_apart() {
+    let (root, folder) = folder();
+    let before = evaluator::report(root.path()).unwrap();
+    let solved = trial("door-lock", &run().models[0], 14, Outcome::SolvedAtReset, 0);
+    folder.write_trial(&Trial { episode: None, ..solved }).unwrap();
+    let summary = evaluator::report(root.path()).unwrap();
+    let row = &summary.rows[0];
+    assert_eq!((row.successes, row.trials, row.solved_at_reset, row.rate), (3, 3, 1, Some(1.0)));
+    assert_eq!(summary.seeds_digest, before.seeds_digest, "they are the same variations");
+    let line = "door-lock, cpn: 1 solved at reset, which are no attempts and not counted";
+    assert!(evaluator::table(&summary).contains(line), "{}", evaluator::table(&summary));
+    let text = |name: &str| std::fs::read_to_string(folder.path(name)).unwrap();
+    assert!(text("trials/door-lock/cpn/1000014.json").contains("\"outcome\": \"solved-at-reset\""));
+    assert!(text("report.html").contains("1 trial was no attempt"));
+    assert!(text("report.html").contains(&summary.seeds_digest));
+    assert_eq!(summary.seeds["door-lock"].iter().collect::<Vec<_>>(), [&1_000_010, &1_000_011, &1_000_013, &1_000_014]);
+    folder.write_run(&Run { trials: 3, ..run() }).unwrap();
+    assert_ne!(evaluator::report(root.path()).unwrap().seeds_digest, summary.seeds_digest);
+}
+
+/// Records from before plans could be set and progress was measured are of the default, and stay as they were.
+#[test]
+fn records_without_settings_and_progress_are_read() {
+    let (root, folder) = folder();
+    for path in ["run.json", "trials/door-lock/cpn/1000010.json"].map(|name| folder.path(name)) {
+        assert!(!std::fs::read_to_string(path).unwrap().contains("planning"));
+    }
+    let path = folder.path("trials/door-lock/cpn/1000010.json");
+    let mut record: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    record["episode"].as_object_mut().unwrap().remove("progress").unwrap();
+    std::fs::write(&path, record.to_string()).unwrap();
+    let row = &evaluator::report(root.path()).unwrap().rows[0];
+    assert_eq!((row.trials, row.mean_best_progress, row.mean_final_progress), (4, Some(0.5), Some(0.25)));
+
+    // Those of other plans are of another run.
+    let planning = Planning { updates: Some(20), ..Planning::default() };
+    let other = trial("door-lock", &run().models[0], 10, Outcome::Success, 40);
+    folder.write_trial(&Trial { planning, ..other }).unwrap();
+    assert_eq!(evaluator::report(root.path()).unwrap().rows[0].trials, 3);
+    folder.write_run(&Run { planning, ..run() }).unwrap();
+    let summary = evaluator::report(root.path()).unwrap();
+    assert_eq!(summary.rows.iter().map(|row| row.trials).collect::<Vec<_>>(), [1, 0, 0, 0]);
+    assert!(evaluator::table(&summary).contains("plans: --updates 20"));
 }
 
 #[test]

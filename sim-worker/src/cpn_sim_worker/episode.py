@@ -51,12 +51,12 @@ class EpisodeRunner:
 
         self.abandon()
         # Also with another seed's goal, so that the same variations are valid with either goal.
-        self._solve(task, seed, "variation.seed")
+        end = self._solve(task, seed, "variation.seed")
         if request.HasField("goal_seed"):
-            self._solve(task, request.goal_seed, "goal_seed")
+            end = self._solve(task, request.goal_seed, "goal_seed")
         goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
 
-        state = self._simulator.reset(task, seed)
+        state, scene = self._simulator.reset(task, seed), self._simulator.scene
         self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
         return sim_pb2.ResetResponse(
             episode_id=self._episode.id,
@@ -64,7 +64,11 @@ class EpisodeRunner:
             observation=self._frame(),
             max_steps=self._max_steps,
             goal_position=goal_position,
-            hand_position=self._hand_position(state),
+            hand_position=_hand_position(state),
+            goal_hand_position=_hand_position(end),
+            success=scene.solved,
+            progress=scene.progress,
+            control=sim_pb2.Control(action_size=scene.action_size, metres=scene.action_metres, hz=scene.control_hz),
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
@@ -97,7 +101,8 @@ class EpisodeRunner:
             reward=transition.reward,
             success=episode.success,
             done=episode.done,
-            hand_position=self._hand_position(transition.state),
+            hand_position=_hand_position(transition.state),
+            progress=self._simulator.scene.progress,
         )
         episode.latest = _Applied(action, response)
         return response, True
@@ -106,20 +111,24 @@ class EpisodeRunner:
         """Ends the running episode, if any; its further steps are refused."""
         self._episode = None
 
-    def _solve(self, task: str, seed: int, field: str) -> None:
-        """Runs the expert, and leaves the simulator at the end; `field` names the seed in a `RequestError`."""
+    def _solve(self, task: str, seed: int, field: str) -> NDArray[np.float64]:
+        """Runs the expert; leaves the simulator at the end, and returns the state there, [S].
+
+        `field` names the seed in a `RequestError`.
+        """
         try:
-            for _ in solve(self._simulator, task, seed):
-                pass
+            *_, end = solve(self._simulator, task, seed)
         except SeedError as error:
             raise invalid(field, error.expected, error.got) from None
         except ExpertFailedError as error:
             code = types_pb2.ERROR_CODE_FAILED_PRECONDITION
             expected = "a seed whose variation the scripted expert solves"
             raise RequestError(code, field, expected, error.seed) from None
-
-    def _hand_position(self, state: NDArray[np.float64]) -> list[float]:
-        return state[: len(self._simulator.scene.goal_position)].tolist()
+        return end.arrival.state
 
     def _frame(self) -> types_pb2.Image:
         return image_to_proto(self._simulator.frame(), str(self._simulator.render_spec))
+
+
+def _hand_position(state: NDArray[np.float64]) -> list[float]:
+    return state[:3].tolist()

@@ -79,12 +79,17 @@ class JengaScene:
 
     action_size = 3
     """Displacement of the hand along the world's x, y and z, each in [-1, 1]; 1 is 1 cm."""
+    action_metres = ACTION_METRES
     control_hz = 10.0
     """At 1 cm per step this is 10 cm/s, half of the real arm's speed; its servos lag by a quarter of a step."""
     camera = Camera("view", flip="rows")
     libraries = ("dm_control",)
     revision = hashlib.sha256(SCENE.read_bytes()).hexdigest()[:16]
 
+    solved: bool
+    """Whether the target block is pushed in, and the rest of the tower stands."""
+    progress: float
+    """Pushed share of the target block's way, 0 to 1."""
     goal_position: NDArray[np.float64]
     """[3], position of the fingertip after a minimal poke: the centre of the target block's face, pushed in."""
 
@@ -131,6 +136,7 @@ class JengaScene:
 
         self._target = self._blocks.index(block.id)
         self._initial = self.data.xpos[self._blocks]
+        self.solved, self.progress = False, 0.0
         half_length = self.model.geom_size[block.geomadr[0], 0]
         self.goal_position = block.pos + np.array([POKE_METRES - half_length, 0, 0])
         return self._state()
@@ -156,9 +162,11 @@ class JengaScene:
 
         moved = self.data.xpos[self._blocks] - self._initial
         others = np.delete(np.linalg.norm(moved, axis=1), self._target)
-        success = moved[self._target, 0] >= POKE_METRES and others.max() < POKE_METRES / 2
+        pushed = moved[self._target, 0]
+        self.solved = bool(pushed >= POKE_METRES and others.max() < POKE_METRES / 2)
+        self.progress = float(np.clip(pushed / POKE_METRES, 0, 1))
         state = self._state()
-        return Transition(state, -float(np.linalg.norm(state[:3] - self.goal_position)), bool(success))
+        return Transition(state, -float(np.linalg.norm(state[:3] - self.goal_position)), self.solved)
 
     def expert(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         """Action of the heuristic expert, [3] in [-1, 1]: move in front of the face, then push straight in."""

@@ -35,6 +35,7 @@ class MetaWorldScene:
         # affect variations; it keeps the constructor from using NumPy's global generator.
         self._env: SawyerXYZEnv = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
         self.control_hz = 1 / self._env.dt
+        self.action_metres = self._env.action_scale
         self.goal_position = np.empty(0)
 
     @property
@@ -46,6 +47,20 @@ class MetaWorldScene:
     def data(self) -> mujoco.MjData:
         """State of the physics."""
         return self._env.data
+
+    @property
+    def solved(self) -> bool:
+        """Whether the task is solved in the present state."""
+        return bool(self._info["success"])
+
+    @property
+    def progress(self) -> float:
+        """How far the object is in place, 0 to 1.
+
+        Of Meta-World's measures the one that all tasks have: `obj_to_target` is always 0 in assembly, disassemble and
+        door-open. Where success asks for less than the whole way, less than 1 is solved.
+        """
+        return float(self._info["in_place_reward"])
 
     def reset(self, seed: int) -> NDArray[np.float64]:
         """Starts the variation of `seed`; returns the state, [39].
@@ -67,12 +82,14 @@ class MetaWorldScene:
         mujoco.mj_forward(env.model, env.data)
         env._prev_obs = env._get_curr_obs_combined_no_goal()
         self._policy = ENV_POLICY_MAP[f"{self._task}-v3"]()
-        return env._get_obs()
+        state = env._get_obs()
+        _, self._info = env.evaluate_state(state, np.zeros(self.action_size, np.float32))
+        return state
 
     def step(self, action: NDArray[np.float32]) -> Transition:
         """Applies an action, [4] in [-1, 1]."""
-        state, reward, _, _, info = self._env.step(action)
-        return Transition(state, float(reward), bool(info["success"]))
+        state, reward, _, _, self._info = self._env.step(action)
+        return Transition(state, float(reward), self.solved)
 
     def expert(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         """Next action of the scripted policy, [4] in [-1, 1]."""

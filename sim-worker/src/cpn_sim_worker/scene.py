@@ -55,6 +55,11 @@ class Scene(Protocol):
         ...
 
     @property
+    def action_metres(self) -> float:
+        """Displacement of the hand's set point by an action of 1, in metres."""
+        ...
+
+    @property
     def control_hz(self) -> float:
         """Control rate, in actions per second of simulated time."""
         ...
@@ -72,6 +77,16 @@ class Scene(Protocol):
     @property
     def goal_position(self) -> NDArray[np.float64]:
         """Goal position of the running variation, [3] in metres; [0] for tasks with a goal image."""
+        ...
+
+    @property
+    def solved(self) -> bool:
+        """Whether the task is solved in the present state."""
+        ...
+
+    @property
+    def progress(self) -> float:
+        """Progress towards success in the present state, 0 to 1."""
         ...
 
     def reset(self, seed: int) -> NDArray[np.float64]:

@@ -84,7 +84,11 @@ fn simulator() -> Vec<Example> {
             observation: image(),
             max_steps: 200,
             goal_position: Some(position()),
-            hand_position: Some(position()),
+            hand_position: position(),
+            goal_hand_position: position(),
+            success: false,
+            progress: 0.25,
+            control: Control { action_size: 4, metres: 0.01, hz: 80.0 },
         }),
         example(StepRequest { episode_id: "reach-5".into(), step: 3, action: action() }),
         example(StepResponse {
@@ -92,7 +96,8 @@ fn simulator() -> Vec<Example> {
             reward: 0.5,
             success: true,
             done: true,
-            hand_position: Some(position()),
+            hand_position: position(),
+            progress: 1.0,
         }),
     ]
 }

@@ -15,6 +15,7 @@ use std::time::Duration;
 use tempfile::TempDir;
 use tokio::process::Command;
 use tokio::time::timeout;
+use wire::planner::{CheckpointSource, LoadModelRequest};
 
 /// Far more than anything here takes; what does not end by then never will.
 pub const LIMIT: Duration = Duration::from_secs(240);
@@ -47,6 +48,13 @@ impl Lab {
         if let Some(planner) = self.planner.take() {
             planner.shutdown().await.unwrap();
         }
+    }
+
+    /// The planner serves the model "cpn" under one more name.
+    pub async fn serve_as(&self, name: &str) {
+        let source = CheckpointSource::File("cpn.safetensors".into());
+        let load = LoadModelRequest { model: name.into(), source };
+        self.planner.as_ref().unwrap().core().load_model(load).await.unwrap();
     }
 
     pub fn out(&self) -> PathBuf {

@@ -1,0 +1,197 @@
+//! Choice of the actions of an episode: by a control, or by a model that a planner is asked for.
+
+use crate::control::Control;
+use crate::link::Link;
+use crate::planning::Planning;
+use crate::presence::Service;
+use crate::record::Model;
+use crate::trial::Fault;
+use recording::plans::{Exchange, Plans};
+use std::time::Instant;
+use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
+use wire::replay::PlannedEpisode;
+use wire::sim::{ResetResponse, Variation};
+use wire::{Code, Error, Image, Observation, Position, key};
+
+/// What chooses the actions of an episode.
+pub(crate) enum Actor<'a> {
+    Control(Control),
+    Planned(Box<Planned<'a>>),
+}
+
+/// Actions to apply before the next are chosen, at least one.
+pub(crate) struct Decided {
+    pub(crate) actions: Vec<Vec<f32>>,
+    /// Time that the choice took.
+    pub(crate) thinking_seconds: f64,
+}
+
+impl<'a> Actor<'a> {
+    /// What acts for a model in an episode that begins; a planner gets to know the goal.
+    pub(crate) async fn new(
+        link: &'a Link,
+        planner: Service,
+        model: &'a Model,
+        planning: &'a Planning,
+        seed: u64,
+        reset: &ResetResponse,
+    ) -> Result<Self, Fault> {
+        if let Some(control) = Control::of(model) {
+            return Ok(Self::Control(control));
+        }
+        let start = Instant::now();
+        let goal = link.goal(&planner, reset).await.map_err(|error| Fault::new(planner.clone(), error))?;
+        let (warm_start, exchanges, plan_steps) = (Vec::new(), Vec::new(), Vec::new());
+        let planned = Planned { link, planner, model, planning, seed, start, goal, warm_start, exchanges, plan_steps };
+        Ok(Self::Planned(Box::new(planned)))
+    }
+
+    /// The next actions, chosen before a step that comes after `step` others.
+    pub(crate) async fn decide(
+        &mut self,
+        reset: &ResetResponse,
+        step: u32,
+        frame: &Image,
+        hand: Position,
+    ) -> Result<Decided, Fault> {
+        match self {
+            Self::Control(control) => Ok(Decided { actions: vec![control.action(reset, hand)], thinking_seconds: 0.0 }),
+            Self::Planned(planner) => planner.decide(reset, step, observed(reset, frame, hand)).await,
+        }
+    }
+
+    /// What the planner was asked, and [`record::Episode::plan_steps`].
+    ///
+    /// # Errors
+    /// If the answers do not fit together.
+    pub(crate) fn end(self, variation: &Variation, reset: &ResetResponse) -> Result<(Option<Plans>, Vec<u32>), Fault> {
+        let Self::Planned(planner) = self else { return Ok((None, Vec::new())) };
+        let mut plan_steps = planner.plan_steps.clone();
+        if plan_steps.iter().zip(0..).all(|(step, plan)| *step == plan) {
+            plan_steps.clear();
+        }
+        Ok((Some(planner.plans(variation, reset)?), plan_steps))
+    }
+}
+
+/// A model that a planner is asked for.
+pub(crate) struct Planned<'a> {
+    link: &'a Link,
+    planner: Service,
+    model: &'a Model,
+    planning: &'a Planning,
+    /// Of the variation.
+    seed: u64,
+    start: Instant,
+    goal: Goal,
+    /// Where the next search begins; at the policy's actions if empty.
+    warm_start: Vec<Vec<f32>>,
+    exchanges: Vec<Exchange>,
+    /// Steps before each of them.
+    plan_steps: Vec<u32>,
+}
+
+impl Planned<'_> {
+    async fn decide(&mut self, reset: &ResetResponse, step: u32, observation: Observation) -> Result<Decided, Fault> {
+        let by_planner = |error| Fault::new(self.planner.clone(), error);
+        let (goal, seed) = (self.goal.clone(), plan_seed(self.seed, step));
+        let request = self.link.plan_request(self.model, self.planning, goal, observation, seed);
+        let request = PlanRequest { warm_start: std::mem::take(&mut self.warm_start), ..request };
+
+        let asked = self.start.elapsed();
+        let mut plan = self.link.plan(&self.planner, request.clone()).await;
+        if plan.as_ref().is_err_and(|e| e.code == Code::NotFound && e.field == "goal_id") {
+            // The planner was restarted, or has evicted the goal.
+            self.link.register_goal(&self.planner, &reset.goal).await.map_err(by_planner)?;
+            plan = self.link.plan(&self.planner, request.clone()).await;
+        }
+        let response = plan.map_err(by_planner)?;
+
+        let applied = self.planning.apply_actions as usize;
+        let later = response.actions.iter().take(applied).skip(1);
+        let later = later.map(|action| action.iter().map(|value| value.clamp(-1.0, 1.0)).collect());
+        let actions = std::iter::once(response.first_action.clone()).chain(later).collect();
+        if self.planning.warm_start {
+            self.warm_start = moved_on(response.warm_start.clone(), applied - 1);
+        }
+        let times = response.times;
+        self.exchanges.push(Exchange { request, asked, response, answered: self.start.elapsed() });
+        self.plan_steps.push(step);
+        Ok(Decided { actions, thinking_seconds: times.queue_seconds + times.encode_seconds + times.plan_seconds })
+    }
+
+    fn plans(self, variation: &Variation, reset: &ResetResponse) -> Result<Plans, Fault> {
+        let episode = PlannedEpisode {
+            variation: variation.clone(),
+            model: self.model.name.clone(),
+            model_digest: self.model.digest.clone(),
+            goal: goal(reset),
+            plans: self.exchanges.len() as u32,
+        };
+        Plans::new(episode, self.exchanges).map_err(|error| Fault::new(self.planner, error))
+    }
+}
+
+/// What an episode's goal is.
+pub(crate) fn goal(reset: &ResetResponse) -> Observation {
+    reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from)
+}
+
+/// A plan moved on by so many more steps, its last action repeated.
+fn moved_on(mut plan: Vec<Vec<f32>>, steps: usize) -> Vec<Vec<f32>> {
+    let horizon = plan.len();
+    plan.drain(..steps.min(horizon.saturating_sub(1)));
+    if let Some(last) = plan.last().cloned() {
+        plan.resize(horizon, last);
+    }
+    plan
+}
+
+/// Seed of the plan before a step: no two steps of an evaluation share one.
+pub(crate) fn plan_seed(variation: u64, step: u32) -> u64 {
+    (variation << 16) + u64::from(step)
+}
+
+/// What a model is shown: where the goal is a position, that of the hand, else the picture.
+pub(crate) fn observed(reset: &ResetResponse, frame: &Image, hand: Position) -> Observation {
+    if reset.goal_position.is_some() { hand.into() } else { frame.clone().into() }
+}
+
+impl Link {
+    /// The goal of an episode as the planner is told it: a position, or the id of a picture that it gets to know.
+    pub(crate) async fn goal(&self, planner: &Service, reset: &ResetResponse) -> Result<Goal, Error> {
+        Ok(match reset.goal_position {
+            Some(position) => Goal::Position(position),
+            None => Goal::Id(self.register_goal(planner, &reset.goal).await?),
+        })
+    }
+
+    pub(crate) fn plan_request(
+        &self,
+        model: &Model,
+        planning: &Planning,
+        goal: Goal,
+        observation: Observation,
+        seed: u64,
+    ) -> PlanRequest {
+        PlanRequest {
+            search: planning.search().filter(|_| model.plans()),
+            seed,
+            deadline: Some(self.timeout),
+            // The one that the run began with, though the planner may swap.
+            model_digest: Some(model.digest.clone()),
+            ..PlanRequest::new(&model.name, goal, observation)
+        }
+    }
+
+    pub(crate) async fn plan(&self, planner: &Service, request: PlanRequest) -> Result<PlanResponse, Error> {
+        self.call(planner, key::planner_plan(planner.name())?, request).await
+    }
+
+    async fn register_goal(&self, planner: &Service, goal: &Image) -> Result<String, Error> {
+        let request = RegisterGoalRequest { image: goal.clone() };
+        let key = key::planner_register_goal(planner.name())?;
+        let response: RegisterGoalResponse = self.call(planner, key, request).await?;
+        Ok(response.goal_id)
+    }
+}

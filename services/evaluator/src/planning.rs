@@ -1,0 +1,143 @@
+//! Settings of plans in closed loop.
+
+use clap::{Args, ValueEnum, value_parser};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use wire::planner::Search;
+use wire::{Error, proto};
+
+/// Plans in closed loop: the search for them, and how they are carried out. By default each model searches in its own way, and
+/// of each plan the first action is applied.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Args, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Planning {
+    /// Solver of the search for actions, of models that plan [default: gradient].
+    #[arg(long, value_enum)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub solver: Option<Solver>,
+    /// Iterations of the search: updates U of the gradient solver, generations of the others [default: the planner's].
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub updates: Option<u32>,
+    /// Plans in each generation, of the solvers that sample [default: the planner's].
+    #[arg(long, requires = "solver")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub samples: Option<u32>,
+    /// Start each search from the plan before, moved on by the applied actions.
+    #[arg(long)]
+    pub warm_start: bool,
+    /// Number of actions of each plan that are applied before the next plan; at most the horizon.
+    #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
+    pub apply_actions: u32,
+    /// Let the simulation go on at its control rate while the planner thinks: the last action is applied again at every step
+    /// until the plan is there, zero before the first. A plan takes at least one step. The planner's time is the one that it
+    /// reports: queueing, encoding and planning.
+    #[arg(long, conflicts_with = "apply_actions")]
+    pub real_time: bool,
+}
+
+impl Default for Planning {
+    fn default() -> Self {
+        Self { solver: None, updates: None, samples: None, warm_start: false, apply_actions: 1, real_time: false }
+    }
+}
+
+impl Planning {
+    /// Whether everything is as by default.
+    pub(crate) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The search that models that plan are asked for; none if it is theirs.
+    pub(crate) fn search(&self) -> Option<Search> {
+        let Self { solver, updates, samples, .. } = *self;
+        (solver.is_some() || updates.is_some() || samples.is_some()).then(|| Search {
+            solver: solver.unwrap_or(Solver::Gradient).into(),
+            iterations: updates,
+            samples,
+            anytime: false,
+        })
+    }
+
+    /// Checks the search by the rules of the wire.
+    ///
+    /// # Errors
+    /// If it would be refused.
+    pub(crate) fn check(&self) -> Result<(), Error> {
+        self.search().map_or(Ok(()), |search| Search::try_from(proto::Search::from(search)).map(drop))
+    }
+}
+
+/// The options that were given, as they are typed.
+impl fmt::Display for Planning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { solver, updates, samples, warm_start, apply_actions, real_time } = self;
+        let options = [
+            solver.and_then(|solver| Some(format!("--solver {}", solver.to_possible_value()?.get_name()))),
+            updates.map(|updates| format!("--updates {updates}")),
+            samples.map(|samples| format!("--samples {samples}")),
+            warm_start.then(|| "--warm-start".into()),
+            (*apply_actions != 1).then(|| format!("--apply-actions {apply_actions}")),
+            real_time.then(|| "--real-time".into()),
+        ];
+        let given: Vec<_> = options.into_iter().flatten().collect();
+        if given.is_empty() { write!(f, "default planning") } else { write!(f, "{}", given.join(" ")) }
+    }
+}
+
+/// Solvers of the search for actions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Solver {
+    /// Gradient descent through the predicted states.
+    Gradient,
+    /// Cross-entropy method.
+    Cem,
+    /// Model predictive path integral control.
+    Mppi,
+    /// Cross-entropy method with gradient steps.
+    Hybrid,
+}
+
+impl From<Solver> for wire::planner::Solver {
+    fn from(solver: Solver) -> Self {
+        match solver {
+            Solver::Gradient => Self::Gradient,
+            Solver::Cem => Self::Cem,
+            Solver::Mppi => Self::Mppi,
+            Solver::Hybrid => Self::Hybrid,
+        }
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn records_without_settings_are_of_the_default() {
+        assert_eq!(serde_json::from_str::<Planning>("{}").unwrap(), Planning::default());
+        assert_eq!(Planning::default().search(), None);
+        let planning = Planning { updates: Some(0), warm_start: true, ..Planning::default() };
+        let json = serde_json::to_string(&planning).unwrap();
+        assert_eq!(serde_json::from_str::<Planning>(&json).unwrap(), planning);
+        assert_eq!(planning.to_string(), "--updates 0 --warm-start");
+        assert_eq!(planning.search().unwrap().iterations, Some(0));
+    }
+
+    #[test]
+    fn a_search_that_the_planner_would_refuse_is_refused() {
+        let of = |solver, updates, samples| Planning { solver, updates, samples, ..Planning::default() };
+        for sound in [of(Some(Solver::Cem), Some(4), Some(64)), of(None, Some(1000), None), Planning::default()] {
+            sound.check().unwrap();
+        }
+        for (wrong, field) in [
+            (of(Some(Solver::Gradient), None, Some(64)), "samples"),
+            (of(Some(Solver::Mppi), None, Some(5000)), "samples"),
+            (of(None, Some(1001), None), "iterations"),
+        ] {
+            assert_eq!(wrong.check().unwrap_err().field, field);
+        }
+    }
+}
