@@ -43,12 +43,14 @@ fn outer_gradients_match_finite_differences() {
         let batch = batch(agent.config(), 3);
         let loss = || agent.outer_loss(&batch);
         loss().backward();
+
         let mut seen = 0;
         for (name, variable) in agent.variables().variables() {
             if !variable.grad().defined() {
                 assert_eq!(name, "step_size", "{method}: every other weight takes part");
                 continue;
             }
+
             let gradient = variable.grad().view(-1);
             let index = gradient.abs().argmax(None, false).int64_value(&[]);
             let mut weight = variable.detach().view(-1).get(index);
@@ -58,6 +60,7 @@ fn outer_gradients_match_finite_differences() {
                 weight -= delta;
                 value
             };
+
             let numeric = (nudged(1e-6) - nudged(-1e-6)) / 2e-6;
             let analytic = gradient.double_value(&[index]);
             assert!(

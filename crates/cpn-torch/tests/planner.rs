@@ -128,6 +128,7 @@ proptest! {
         let ((x, xs), (x_g, x_gs)) = (embeddings(rows, latent, seed), embeddings(rows, latent, seed + 1));
         let reference = agent.plan(&xs, &x_gs);
         let others = perturbed(&agent, &xs, &x_gs);
+
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
             let plans = planner.plan(&queries(&x, &x_g, &[]), &mut fixed(Solver::Gradient, updates));
@@ -236,6 +237,7 @@ fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
         let ((x, _), (x_g, _)) = (embeddings(45, latent, 1), embeddings(45, latent, 2));
         let together = queries(&x, &x_g, &[]);
         let images = noise_images(5, 3);
+
         let mut by_native = planner(&Native { threads: 1 }, &model);
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
@@ -250,6 +252,7 @@ fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
                     assert_eq!(all, native, "{engine:?} {method} {solver:?}");
                 }
             }
+
             let frames = observed(&images);
             let all = planner.encode(&frames);
             for (frame, x) in frames.iter().zip(&all) {
@@ -338,6 +341,7 @@ fn a_search_in_pieces_equals_one_in_a_single_piece() {
         let planner = &mut *planner;
         let start = if start { search(planner, Solver::Cem(40), Iterations::Fixed(1), &[]).actions } else { vec![] };
         let queries = queries(&x, &x_g, &start);
+
         for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
             let whole = planner.plan(&queries[..1], &mut fixed(solver, 5)).remove(0);
             for pieces in [1, 2, 1000] {
@@ -370,6 +374,7 @@ fn a_search_continues_without_removed_queries() {
         let ((x, _), (x_g, _)) = (embeddings(7, 6, 1), embeddings(7, 6, 2));
         let mut queries = queries(&x, &x_g, &[]);
         let mut expected = planner.plan(&queries, &mut fixed(Solver::Gradient, 9));
+
         let mut ongoing = Ongoing::new(Solver::Gradient, 9, false);
         // In the end one of three threads has no query left.
         for gone in [6, 2, 4, 0, 0] {
@@ -381,6 +386,7 @@ fn a_search_continues_without_removed_queries() {
         while !ongoing.is_over() {
             planner.resume(&queries, &mut ongoing, &mut || true);
         }
+
         let numbers = |plans: &[Plan]| {
             let all = plans.iter().flat_map(|plan| plan.actions.iter().flatten());
             all.map(|number| f64::from(*number)).collect::<Vec<_>>()

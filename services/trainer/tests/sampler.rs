@@ -75,9 +75,11 @@ fn a_batch_matches_the_recordings() {
         let sampler = Sampler::new(&dataset, &recipe, 3);
         let samples = sampler.epoch(0);
         let batch = sampler.batch(0, &samples);
+
         let frames = batch.frames.observed();
         let distinct: BTreeSet<_> = samples.iter().flat_map(|s| [(s.episode, s.step), (s.episode, s.goal)]).collect();
         assert_eq!(frames.len(), distinct.len(), "each frame once");
+
         let (actions, mask) = (&batch.actions, &batch.mask);
         for (row, s) in samples.iter().enumerate() {
             let recorded = |number| step("reach", s.episode.into(), STEPS[s.episode as usize], number);

@@ -246,6 +246,7 @@ impl<E: Operand> SingleRow<'_, '_, E> {
         for (p, values) in panels.iter_mut().enumerate() {
             *values = b.panel(panel + p, NR_VECTORS * Vector::<S, E::Sum>::COUNT);
         }
+
         let lines = |k: usize| {
             let mut lines = panels;
             for line in &mut lines {
@@ -315,6 +316,7 @@ fn accumulate<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: 
             for (i, b) in b.iter_mut().enumerate() {
                 *b = E::load(simd, part(i));
             }
+
             for (r, sums) in sums.iter_mut().enumerate() {
                 let a = E::splat(simd, a(r, k));
                 for (sum, b) in sums[p].iter_mut().zip(b) {

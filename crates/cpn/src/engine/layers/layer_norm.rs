@@ -83,9 +83,11 @@ mod tests {
             let norm = LayerNorm { weight: weight.to_vec(), bias: bias.to_vec() };
             norm.forward(x).iter().zip(&y_hat).map(|(y, y_hat)| y * y_hat).sum::<f64>()
         };
+
         let norm = LayerNorm { weight: weight.clone(), bias: bias.clone() };
         let (mut x_hat, mut gradient) = (y_hat.clone(), norm.gradient());
         norm.vjp(&x, &mut x_hat, &mut gradient);
+
         let moved = |values: &[f64], i: usize, by: f64| {
             let mut values = values.to_vec();
             values[i] += by;
@@ -95,6 +97,7 @@ mod tests {
             let expected = (f(1e-5) - f(-1e-5)) / 2e-5;
             assert!((ours - expected).abs() < 1e-7 * (1.0 + expected.abs()), "{ours} for {expected}");
         };
+
         for (i, x_hat) in x_hat.iter().enumerate() {
             check(*x_hat, &|by| loss(&weight, &bias, &moved(&x, i, by)));
         }

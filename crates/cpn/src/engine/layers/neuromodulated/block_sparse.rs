@@ -75,6 +75,7 @@ impl<T: Element> BlockSparseLinear<T> {
             bias: zeros(blocks * width),
             zeros: zeros(blocks * width),
         };
+
         for (i, block) in layer.weight.chunks_exact_mut(inputs * width).enumerate() {
             let rows: Vec<_> = (0..outputs).map(|o| &weight[(o * blocks + i) * inputs..][..inputs]).collect();
             for (k, line) in block.chunks_exact_mut(width).enumerate() {

@@ -224,8 +224,10 @@ mod tests {
             };
             a2.chunks(sizes.hidden).zip(b2).map(attenuation).collect::<Vec<_>>()
         };
+
         let (u, v) = (gate("u"), gate("v"));
         let (a, b) = (weight("weight"), weight("bias"));
+
         let mut y = vec![0.0; sizes.outputs];
         let mut y_dot = vec![0.0; sizes.outputs];
         for o in 0..sizes.outputs {
