@@ -1,4 +1,4 @@
-//! What the fuzzers of the decoders share. Each is a program in `src/bin`; `make fuzz` runs them.
+//! Common parts of the decoders' fuzzers, which are programs in `src/bin`; `make fuzz` runs them.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::fmt::Debug;
@@ -6,16 +6,16 @@ use std::fs;
 use std::path::Path;
 use std::ptr;
 
-/// Most bytes that a decoder may ask for at once: twice the largest message, checkpoint or recording.
+/// Maximum size of an allocation, in bytes: twice that of the largest message, checkpoint or recording.
 const MAX_ALLOCATION_BYTES: usize = 128 << 20;
 
-/// The system's memory, but for pieces so large that only a fault asks for them.
+/// The system's allocator, with failing allocations above [`MAX_ALLOCATION_BYTES`], which only a faulty decoder requests.
 struct Bounded;
 
 #[global_allocator]
 static ALLOCATOR: Bounded = Bounded;
 
-// SAFETY: whatever is allocated is the system allocator's, by the same arguments.
+// SAFETY: all successful calls are forwarded to the system's allocator, with the same arguments.
 #[expect(unsafe_code, reason = "an allocator")]
 unsafe impl GlobalAlloc for Bounded {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
@@ -27,10 +27,10 @@ unsafe impl GlobalAlloc for Bounded {
     }
 }
 
-/// Lays inputs into the corpus of a fuzzer, to begin with.
+/// Writes the seed inputs of a fuzzer to its corpus.
 ///
 /// # Panics
-/// If they cannot be written, or one of them is refused: it would lead the fuzzer no further than noise.
+/// If a file cannot be written, or `check` refuses an input, which would then be no better a seed than random bytes.
 pub fn seed<E: Debug>(fuzzer: &str, inputs: Vec<Vec<u8>>, check: fn(&[u8]) -> Result<(), E>) {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(fuzzer);
     fs::create_dir_all(&folder).expect("a folder for the corpus");

@@ -1,4 +1,4 @@
-//! A learned method of the comparison, to be trained (section "Methods for comparison").
+//! Agent: a learned method of the comparison, differentiable by autograd (section "Methods for comparison").
 
 use crate::dynamics::PolicyDynamics;
 use crate::encoder::Encoder;
@@ -19,7 +19,7 @@ pub struct Agent {
 }
 
 impl Agent {
-    /// The agent of a model whose weights fit its configuration, on a device.
+    /// The agent of a valid model on a device.
     pub fn new(model: &Model, device: Device) -> Self {
         let Model { config, weights } = model;
         let variables = nn::VarStore::new(device);
@@ -37,34 +37,34 @@ impl Agent {
         agent
     }
 
-    /// Sizes and method.
+    /// Configuration of the model.
     pub fn config(&self) -> &ModelConfig {
         &self.config
     }
 
-    /// The named weights.
+    /// Weights by name.
     pub fn variables(&self) -> &nn::VarStore {
         &self.variables
     }
 
-    /// The named weights, for freezing or changing their kind.
+    /// Mutable weights by name, for freezing them or changing their kind.
     pub fn variables_mut(&mut self) -> &mut nn::VarStore {
         &mut self.variables
     }
 
-    /// The outer loss of a batch, a scalar, differentiable in the weights *through* the inner loop's updates, all of it by
-    /// autograd: the reference for [`OuterLoss`](cpn::engine::OuterLoss).
+    /// The outer loss of a batch, a scalar, differentiable in the weights through the inner loop's updates by autograd: the
+    /// reference for [`OuterLoss`](cpn::engine::OuterLoss).
     pub fn outer_loss(&self, batch: &TensorBatch) -> Tensor {
         self.embedded_loss(&self.encoder.encode(&batch.frames), batch)
     }
 
-    /// The outer loss of a batch whose frames are embedded, `[F, Z]`.
+    /// The outer loss of a batch with embedded frames, `[F, Z]`.
     pub fn embedded_loss(&self, embeddings: &Tensor, batch: &TensorBatch) -> Tensor {
         let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));
         loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), &batch.actions, &batch.mask)
     }
 
-    /// The planned actions `[B, H, A]` from x to x_g, both `[B, Z]`, with their graph.
+    /// Planned actions, `[B, H, A]`, from x to x_g, both `[B, Z]`, with their graph.
     pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         if self.config.method.plans() {
             self.inner_loop().plan_differentiably(x, x_g).actions
@@ -73,7 +73,7 @@ impl Agent {
         }
     }
 
-    /// The image encoder.
+    /// The encoder.
     pub fn encoder(&self) -> &Encoder {
         &self.encoder
     }
@@ -93,17 +93,17 @@ impl Agent {
         self.network.policy(&self.network.features(x, x_g)).unsqueeze(1)
     }
 
-    /// H, the number of actions in a plan.
+    /// H, the planning horizon.
     pub fn horizon(&self) -> i64 {
         self.config.horizon
     }
 
-    /// Embeds observations or goals, images `[B, 84, 84, 3]` or positions `[B, 3]`, as `[B, Z]`.
+    /// Embeddings, `[B, Z]`, of images, `[B, 84, 84, 3]`, or positions, `[B, 3]`, without a graph.
     pub fn encode(&self, input: &Tensor) -> Tensor {
         tch::no_grad(|| self.encoder.encode(input))
     }
 
-    /// Plans from x to x_g, both `[B, Z]`: the reference for [`Planner`](cpn::Planner).
+    /// Plans from x to x_g, both `[B, Z]`, without a graph: the reference for [`Planner`](cpn::Planner).
     pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         if self.config.method.plans() {
             self.inner_loop().plan(x, x_g)

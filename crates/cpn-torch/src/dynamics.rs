@@ -1,11 +1,11 @@
-//! g_θ, the combined policy and dynamics network (figure "encoder", b).
+//! Policy dynamics network g_θ (figure "encoder", b).
 
 use crate::neuromodulated::Neuromodulated;
 use cpn::ModelConfig;
 use tch::Tensor;
 use tch::nn::{self, Module};
 
-/// A shared trunk, a policy branch and a dynamics branch that also sees the action.
+/// The network g_θ: a shared trunk, a policy branch, and a dynamics branch with the action as an additional input.
 #[derive(Debug)]
 pub struct PolicyDynamics {
     trunk: Dense,
@@ -15,8 +15,8 @@ pub struct PolicyDynamics {
 }
 
 impl PolicyDynamics {
-    /// Builds g_θ under `path`: without the dynamics branch for methods that do not plan, with neuromodulated layers and
-    /// goal conditioning where the method has them.
+    /// Builds the variables under `path`, by the method: with a dynamics branch if it plans, neuromodulated layers and goal
+    /// conditioning if it has them.
     pub fn new(path: &nn::Path, config: &ModelConfig) -> Self {
         let ModelConfig { method, hidden, actions, .. } = *config;
         let latent = config.encoder.latent();
@@ -32,18 +32,18 @@ impl PolicyDynamics {
         }
     }
 
-    /// The trunk's features of a state: x `[B, Z]` and the goal x_g `[B, Z]` to `[B, hidden]`.
+    /// The trunk: features `[B, hidden]` of a state x and a goal x_g, both `[B, Z]`.
     pub fn features(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         let input = if self.goal_conditioned { Tensor::cat(&[x, x_g], 1) } else { x.shallow_clone() };
         self.trunk.forward(&input).relu()
     }
 
-    /// The policy branch: features `[B, hidden]` to an action `[B, A]` in (-1, 1).
+    /// The policy branch: an action `[B, A]` in (-1, 1) of features `[B, hidden]`.
     pub fn policy(&self, features: &Tensor) -> Tensor {
         self.policy[1].forward(&self.policy[0].forward(features).relu()).tanh()
     }
 
-    /// The dynamics branch: the state `[B, Z]` after an action `[B, A]`, predicted as a change of x.
+    /// The dynamics branch: the state `[B, Z]` after an action `[B, A]`, predicted as a difference to x.
     ///
     /// # Panics
     /// If the method does not plan.
@@ -53,7 +53,7 @@ impl PolicyDynamics {
     }
 }
 
-/// A fully connected layer, neuromodulated or not.
+/// A fully connected layer, plain or neuromodulated.
 #[derive(Debug)]
 enum Dense {
     Linear(nn::Linear),

@@ -1,11 +1,11 @@
-//! The encoder f_φ, shared by observation and goal (figure "encoder", a).
+//! Encoder f_φ, shared by observation and goal (figure "encoder", a).
 
 use cpn::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use cpn::{images, positions};
 use tch::nn::{self, Module};
 use tch::{Kind, Tensor};
 
-/// What suits the input, then a linear layer to the embedding.
+/// The encoder: convolutions or linear layers by the kind of input, a linear layer to the embedding, and layer normalisation.
 #[derive(Debug)]
 pub struct Encoder {
     body: Body,
@@ -13,7 +13,7 @@ pub struct Encoder {
     layer_norm: Option<nn::LayerNorm>,
 }
 
-/// From the input to features, `[B, F]`.
+/// Layers from the input to features, `[B, F]`.
 #[derive(Debug)]
 enum Body {
     Image { convolutions: Vec<nn::Conv2D> },
@@ -21,7 +21,7 @@ enum Body {
 }
 
 impl Encoder {
-    /// Builds the encoder's variables under `path`. The configuration must be valid.
+    /// Builds the variables under `path`, of a valid configuration.
     pub fn new(path: &nn::Path, config: &EncoderConfig) -> Self {
         let (body, features) = match config {
             EncoderConfig::Image(config) => Body::image(path, config),
@@ -33,7 +33,7 @@ impl Encoder {
         Self { body, linear, layer_norm }
     }
 
-    /// Embeds images, `[B, 84, 84, 3]` bytes, or positions, `[B, 3]` in metres, as `[B, Z]`.
+    /// Embeddings, `[B, Z]`, of images, `[B, 84, 84, 3]` bytes, or positions, `[B, 3]` in metres.
     pub fn encode(&self, input: &Tensor) -> Tensor {
         self.normalise(self.linear.forward(&self.body.features(input, self.kind())))
     }
@@ -45,14 +45,14 @@ impl Encoder {
         }
     }
 
-    /// The kind of the weights: float, or double in gradient checks.
+    /// Kind of the weights: float, or double in gradient checks.
     pub fn kind(&self) -> Kind {
         self.linear.ws.kind()
     }
 }
 
 impl Body {
-    /// The convolutions, and F.
+    /// The convolutions; returns them with F.
     fn image(path: &nn::Path, config: &ImageEncoderConfig) -> (Self, i64) {
         let mut channels = images::CHANNELS;
         let mut convolutions = Vec::new();
@@ -65,7 +65,7 @@ impl Body {
         (Self::Image { convolutions }, channels * size * size)
     }
 
-    /// The linear layers, and F.
+    /// The linear layers; returns them with F.
     fn position(path: &nn::Path, config: &PositionEncoderConfig) -> (Self, i64) {
         let mut width = positions::SIZE;
         let mut layers = Vec::new();

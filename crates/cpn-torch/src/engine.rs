@@ -1,4 +1,4 @@
-//! The engine of libtorch: plans and training on any of its devices.
+//! Engine of libtorch: plans and training on the processor or a CUDA device.
 
 use crate::learner::TorchLearner;
 use crate::planner::TorchPlanner;
@@ -8,7 +8,7 @@ use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use tch::{Cuda, Device};
 
-/// libtorch on one device, in float32.
+/// libtorch's engine on one device, in float32.
 #[derive(Debug, Clone, Copy)]
 pub struct Torch {
     device: Device,
@@ -16,10 +16,10 @@ pub struct Torch {
 }
 
 impl Torch {
-    /// An engine on the processor, by so many threads, or on the CUDA device of this index.
+    /// An engine on the processor, with `threads` threads, or on a CUDA device, by its index.
     ///
     /// # Errors
-    /// If there is no such device, or this libtorch is built without CUDA.
+    /// If the device does not exist, or libtorch is built without CUDA.
     pub fn new(cuda: Option<usize>, threads: usize) -> Result<Self, EngineError> {
         let Some(index) = cuda else { return Ok(Self { device: Device::Cpu, threads }) };
         let count = if Cuda::is_available() { Cuda::device_count() } else { 0 };
@@ -43,7 +43,7 @@ impl Engine for Torch {
     }
 }
 
-/// Runs operations of libtorch, by which `tch` panics if they fail: a device that is out of memory, for one.
+/// Runs operations of libtorch. `tch` panics if one fails, for example if the device is out of memory; the panic becomes an error.
 pub fn on_device<T>(device: Device, run: impl FnOnce() -> T) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(run)).map_err(|panic| format!("device {}: {}", name(device), message(&*panic)))
 }
@@ -55,7 +55,7 @@ fn name(device: Device) -> String {
     }
 }
 
-/// The first line of a panic's message: a trace of C++ follows.
+/// The first line of a panic's message, without the C++ trace after it.
 fn message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str).or_else(|| panic.downcast_ref::<&str>().copied());
     text.and_then(|text| text.lines().next()).unwrap_or("failed")

@@ -1,40 +1,38 @@
-//! The inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks"), by
-//! autograd. What is served does the same without a graph ([`cpn::engine`]).
+//! Inner loop: planning by backpropagation towards the goal's embedding (section "Universal planning networks"), by autograd. The
+//! native engine computes the same without a graph ([`cpn::engine`]).
 
 use crate::dynamics::PolicyDynamics;
 use tch::{Kind, Reduction, Tensor};
 
-/// Where the Huber loss turns from quadratic to linear.
+/// δ of the Huber loss: quadratic up to it, linear beyond.
 const HUBER_DELTA: f64 = 1.0;
 
-/// A planned action sequence and how close it is predicted to come.
+/// Planned action sequences with their inner losses.
 #[derive(Debug)]
 pub struct TensorPlan {
     /// â_{t:t+H}, `[B, H, A]`; not clipped.
     pub actions: Tensor,
-    /// The inner loss of each plan `[B]`, before each update and, unless training, after the last; empty for methods
-    /// that do not plan.
+    /// Inner losses, `[B]` each, before each update and, except in training, after the last; empty for methods that do not plan.
     pub inner_losses: Vec<Tensor>,
 }
 
-/// How an inner loop is run.
+/// An inner loop with its settings.
 #[derive(Debug, Clone, Copy)]
 pub struct InnerLoop<'a> {
     /// g_θ.
     pub network: &'a PolicyDynamics,
     /// α, the learned step size of an update, a scalar.
     pub step_size: &'a Tensor,
-    /// H, the number of planned steps.
+    /// H, the planning horizon.
     pub horizon: i64,
     /// U, the number of updates.
     pub updates: i64,
 }
 
 impl InnerLoop<'_> {
-    /// Plans from x to x_g, both `[B, Z]`, starting from the policy's rollout.
+    /// Plans from x to x_g, both `[B, Z]`, from the policy's rollout, without a graph.
     ///
-    /// Each plan of a batch is independent of the others: the loss is summed over the batch, so that the step an action
-    /// takes does not depend on B.
+    /// The loss is summed over the batch, not averaged, so that a plan's updates do not depend on B.
     pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         let _grad = tch::no_grad_guard();
         let mut actions = self.policy_rollout(x, x_g);
@@ -49,20 +47,20 @@ impl InnerLoop<'_> {
         TensorPlan { actions, inner_losses }
     }
 
-    /// The same plan with the graph of every update kept, for the outer loop to differentiate through.
+    /// The plans of [`Self::plan`] with the graph of all updates, for the outer loop.
     pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
         let mut actions = self.policy_rollout(x, x_g);
         let mut inner_losses = Vec::new();
         for _ in 0..self.updates {
             let (loss, gradient) = self.loss_and_gradient(x, x_g, &actions, true);
             inner_losses.push(loss.detach());
-            // Not `-=`, which would overwrite what the graph still needs.
+            // Not `-=`, which would overwrite a tensor of the graph.
             actions = &actions - self.step_size * gradient;
         }
         TensorPlan { actions, inner_losses }
     }
 
-    /// The initial plan: the actions `[B, H, A]` of the policy along its own predicted states.
+    /// The initial plan: the policy's actions, `[B, H, A]`, along the predicted states.
     pub fn policy_rollout(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         let mut x = x.shallow_clone();
         let mut actions = Vec::new();
@@ -77,8 +75,8 @@ impl InnerLoop<'_> {
         Tensor::stack(&actions, 1)
     }
 
-    /// The inner loss of each plan, `[B]`: Huber between the state predicted after `actions` `[B, H, A]` and the goal,
-    /// summed over the latent.
+    /// Inner losses, `[B]`: Huber loss between the predicted state after `actions`, `[B, H, A]`, and the goal, summed over the
+    /// latent.
     pub fn loss(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Tensor {
         let mut x = x.shallow_clone();
         for action in actions.unbind(1) {
@@ -88,7 +86,7 @@ impl InnerLoop<'_> {
         x.huber_loss(x_g, Reduction::None, HUBER_DELTA).sum_dim_intlist(1, false, None::<Kind>)
     }
 
-    /// The inner loss `[B]` and its gradient in the actions `[B, H, A]`.
+    /// Inner losses, `[B]`, and their gradient in the actions, `[B, H, A]`, itself differentiable with `create_graph`.
     pub fn loss_and_gradient(
         &self,
         x: &Tensor,

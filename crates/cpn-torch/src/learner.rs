@@ -1,4 +1,4 @@
-//! Training steps by libtorch: the outer loss differentiated by autograd, and Adam over all weights at once.
+//! Training steps by libtorch: the outer loss differentiated by autograd, and Adam on one vector of all weights.
 
 use crate::agent::Agent;
 use crate::engine::on_device;
@@ -22,36 +22,40 @@ pub struct TorchLearner {
     device: Device,
     threads: usize,
     max_gradient_norm: f64,
-    /// The agent's weights by name, parts of `values`.
+    /// The agent's weights by name, views of `values`.
     weights: BTreeMap<String, Tensor>,
-    /// All weights in one row, in the order of their names; the same memory.
+    /// All weights as one vector, in the order of their names.
     values: Tensor,
-    /// Running means of their gradients and of the gradients' squares.
+    /// First moment of the gradients, as one vector.
     mean: Tensor,
+    /// Second moment of the gradients, as one vector.
     square: Tensor,
     /// Number of updates so far.
     steps: u32,
 }
 
 impl TorchLearner {
-    /// Training of a model by valid settings; on the processor it computes on so many threads.
+    /// A learner of a valid model with valid settings; `threads` applies to the processor.
     pub fn new(model: &Model, training: &Training, device: Device, threads: usize) -> Self {
         let agent = Agent::new(model, device);
         let mut weights: BTreeMap<String, Tensor> = agent.variables().variables().into_iter().collect();
         let flat: Vec<Tensor> = weights.values().map(|weight| weight.detach().flatten(0, -1)).collect();
         let values = Tensor::cat(&flat, 0);
+
+        // The variables become views of the vector, so that one update changes all of them.
         let mut first = 0;
         for weight in weights.values_mut() {
             let part = values.narrow(0, first, weight.numel() as i64).view_as(weight);
             weight.set_data(&part);
             first += weight.numel() as i64;
         }
+
         let (mean, square) = (values.zeros_like(), values.zeros_like());
         let max_gradient_norm = training.max_gradient_norm;
         Self { agent, device, threads, max_gradient_norm, weights, values, mean, square, steps: 0 }
     }
 
-    /// The gradient of a loss in all weights, in one row; 0 in a weight that takes no part.
+    /// The gradient of a loss in all weights, as one vector; 0 for weights that do not affect it.
     fn gradient(&mut self, loss: &Tensor) -> Tensor {
         loss.backward();
         let of = |weight: &mut Tensor| {
@@ -65,7 +69,7 @@ impl TorchLearner {
         gradient
     }
 
-    /// An update by a gradient, of at most the maximum norm; returns the norm before clipping.
+    /// An update by a gradient, clipped to the maximum norm; returns the norm before clipping.
     fn update(&mut self, gradient: &Tensor, learning_rate: f64) -> f64 {
         let norm = gradient.norm().double_value(&[]);
         let clipped = gradient * (self.max_gradient_norm / (norm + 1e-6)).min(1.0);
@@ -81,7 +85,7 @@ impl TorchLearner {
 
     fn step_on_device(&mut self, batch: &Batch, learning_rate: f64) -> Result<Step, LearnerError> {
         if !self.device.is_cuda() {
-            // libtorch's number of threads belongs to the calling thread.
+            // libtorch's number of threads is a setting of the calling thread.
             tch::set_num_threads(self.threads as i32);
         }
         let started = Instant::now();
@@ -105,11 +109,11 @@ impl TorchLearner {
         Ok(Step { loss, gradient_norm, times })
     }
 
-    /// Rows of all weights by their names.
-    fn by_name<'a>(&'a self, row: &'a Tensor) -> impl Iterator<Item = (&'a String, archive::Tensor)> {
+    /// A vector over all weights, divided by their names.
+    fn by_name<'a>(&'a self, vector: &'a Tensor) -> impl Iterator<Item = (&'a String, archive::Tensor)> {
         let mut first = 0;
         self.weights.iter().map(move |(name, weight)| {
-            let part = row.narrow(0, first, weight.numel() as i64).view_as(weight);
+            let part = vector.narrow(0, first, weight.numel() as i64).view_as(weight);
             first += weight.numel() as i64;
             (name, tensors::to_archive(&part))
         })
@@ -128,12 +132,12 @@ impl Learner for TorchLearner {
 
     fn state(&self) -> Tensors {
         let parts = [("weight", &self.values), ("mean", &self.mean), ("square", &self.square)];
-        let named = |(part, row)| self.by_name(row).map(move |(name, tensor)| (format!("{part}.{name}"), tensor));
+        let named = |(part, vector)| self.by_name(vector).map(move |(name, tensor)| (format!("{part}.{name}"), tensor));
         parts.into_iter().flat_map(named).collect()
     }
 
     fn restore(&mut self, state: &Tensors, steps: u32) -> Result<(), LearnerError> {
-        for (part, row) in [("weight", &self.values), ("mean", &self.mean), ("square", &self.square)] {
+        for (part, vector) in [("weight", &self.values), ("mean", &self.mean), ("square", &self.square)] {
             let mut first = 0;
             for (name, weight) in &self.weights {
                 let name = format!("{part}.{name}");
@@ -141,8 +145,8 @@ impl Learner for TorchLearner {
                 let saved =
                     state.get(&name).filter(|saved| saved.shape() == shape && saved.elements::<f32>().is_some());
                 let saved = saved.ok_or(LearnerError::State { name, shape })?;
-                let mut place = row.narrow(0, first, weight.numel() as i64).view_as(weight);
-                tch::no_grad(|| place.copy_(&tensors::from_archive(saved)));
+                let mut target = vector.narrow(0, first, weight.numel() as i64).view_as(weight);
+                tch::no_grad(|| target.copy_(&tensors::from_archive(saved)));
                 first += weight.numel() as i64;
             }
         }

@@ -1,10 +1,11 @@
 //! Contextual Planning Networks in libtorch.
 //!
-//! The reference: the paper's ideas, a file each, differentiated by autograd. [`encoder`] is f_φ, [`neuromodulated`] the layer with
-//! attenuated weights, [`dynamics`] g_θ, the combined policy and dynamics; [`inner_loop`] plans, [`loss`] is that of the outer loop,
-//! and [`agent`] puts them together for each of the compared methods. The native engine of the crate `cpn` is held to it.
+//! The reference: one file for each part of the method, differentiated by autograd. [`encoder`] is f_φ, [`neuromodulated`] the
+//! layer with attenuated weights, [`dynamics`] the policy dynamics network g_θ, [`inner_loop`] the planning, [`loss`] the outer
+//! loss, and [`agent`] their combination for each of the compared methods. The tests compare the native engine of the crate `cpn`
+//! with it.
 //!
-//! The engine, [`Torch`]: the same networks behind the interface of every [`Engine`](cpn::Engine), on any device of libtorch.
+//! The engine, [`Torch`]: the same networks behind the interface [`Engine`](cpn::Engine), on any device of libtorch.
 
 pub mod agent;
 pub mod dynamics;

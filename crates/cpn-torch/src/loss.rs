@@ -1,4 +1,4 @@
-//! The outer loop: behaviour cloning of the planned actions, through the inner loop.
+//! Outer loss: behaviour cloning of the planned actions.
 
 use crate::tensors;
 use cpn::Batch;
@@ -13,7 +13,7 @@ pub struct TensorBatch {
     pub observations: Tensor,
     /// Index of each sample's goal among the frames, `[B]` integers.
     pub goals: Tensor,
-    /// The demonstrated actions that follow, `[B, H, A]`; 0 past the demonstration's end.
+    /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Tensor,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Tensor,
@@ -34,8 +34,8 @@ impl TensorBatch {
     }
 }
 
-/// Mean squared error between planned and demonstrated actions, both `[B, H, A]`, over the steps that the demonstration
-/// still has: `mask` `[B, H]` is 1 there and 0 past its end.
+/// Mean squared error between planned and demonstrated actions, both `[B, H, A]`, over the steps within the demonstration, where
+/// `mask`, `[B, H]`, is 1; it is 0 past the end.
 pub fn behaviour_cloning(planned: &Tensor, demonstrated: &Tensor, mask: &Tensor) -> Tensor {
     let actions = planned.size()[2] as f64;
     let squared = (planned - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);

@@ -1,12 +1,13 @@
-//! The neuromodulated fully connected layer (section "Neuromodulated meta-learning").
+//! Neuromodulated fully connected layer (section "Neuromodulated meta-learning").
 
 use tch::Tensor;
 use tch::nn::{self, Init, Module};
 
-/// Attenuation starts near 1 (sigmoid(2) = 0.88), so that training starts from an almost plain linear layer.
+/// Initial bias of the attenuation networks' outputs: sigmoid(2) = 0.88, so that a layer is almost linear at the start of
+/// training.
 const GATE_BIAS: f64 = 2.0;
 
-/// `y = (u_β(x) ⊙ a) x + (v_γ(x) ⊙ b)`: each weight and bias is attenuated by a factor in [0, 1] that depends on the
+/// The layer y = (u_β(x) ⊙ a) x + v_γ(x) ⊙ b, with an attenuation factor in (0, 1) for each weight and bias, computed from the
 /// input.
 #[derive(Debug)]
 pub struct Neuromodulated {
@@ -16,7 +17,7 @@ pub struct Neuromodulated {
 }
 
 impl Neuromodulated {
-    /// A layer from `inputs` to `outputs` whose attenuation networks have `gate_hidden` hidden units.
+    /// A layer from `inputs` to `outputs`, with `gate_hidden` hidden units in the attenuation networks.
     pub fn new(path: &nn::Path, inputs: i64, outputs: i64, gate_hidden: i64) -> Self {
         Self {
             linear: nn::linear(path, inputs, outputs, Default::default()),
@@ -27,7 +28,7 @@ impl Neuromodulated {
 }
 
 impl Module for Neuromodulated {
-    /// `[B, inputs]` to `[B, outputs]`.
+    /// y `[B, outputs]` of x `[B, inputs]`.
     fn forward(&self, x: &Tensor) -> Tensor {
         let (outputs, inputs) = self.linear.ws.size2().expect("a linear layer's weight is a matrix");
         let weight = self.u.forward(x).view([-1, outputs, inputs]) * &self.linear.ws;
@@ -36,7 +37,7 @@ impl Module for Neuromodulated {
     }
 }
 
-/// u_β or v_γ: two linear layers, rectified linear between, sigmoid at the end.
+/// Attenuation network u_β or v_γ: two linear layers, with a rectified linear unit between them and a sigmoid at the end.
 #[derive(Debug)]
 struct Gate {
     hidden: nn::Linear,
@@ -45,10 +46,10 @@ struct Gate {
 
 impl Gate {
     fn new(path: &nn::Path, inputs: i64, hidden: i64, outputs: i64) -> Self {
-        let open = nn::LinearConfig { bs_init: Some(Init::Const(GATE_BIAS)), ..Default::default() };
+        let output = nn::LinearConfig { bs_init: Some(Init::Const(GATE_BIAS)), ..Default::default() };
         Self {
             hidden: nn::linear(path / "hidden", inputs, hidden, Default::default()),
-            output: nn::linear(path / "output", hidden, outputs, open),
+            output: nn::linear(path / "output", hidden, outputs, output),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Plans by libtorch.
+//! Planner of libtorch's engine.
 
 use crate::agent::Agent;
 use crate::tensors;
@@ -8,9 +8,9 @@ use cpn::search::block::{Actions, PlanBlock, Purpose};
 use cpn::{Input, Method, Model, ModelConfig};
 use tch::{Device, Kind, Tensor};
 
-/// R on the processor. Fewer rows are padded: a plan comes out the same alone or among others.
+/// R on the processor. Smaller batches are padded, so that a plan does not depend on the rest of the batch.
 const CPU_ROWS: usize = 16;
-/// R on a CUDA device, where more rows take little more time.
+/// R on a CUDA device, where the time hardly grows with the rows.
 const CUDA_ROWS: usize = 256;
 
 /// A learned method on a device of libtorch.
@@ -26,17 +26,18 @@ struct TorchBlock {
     agent: Agent,
     device: Device,
     threads: usize,
-    /// R.
+    /// R, the number of rows.
     capacity: usize,
     /// Actions, `[R, H, A]`.
     actions: Vec<f32>,
-    /// Actions of the last rollout, `[R, H, A]`, and its inner losses, `[R]`, with their graph.
+    /// Actions, `[R, H, A]`, and inner losses, `[R]`, of the last rollout, with their graph.
     rollout: Option<(Tensor, Tensor)>,
+    /// Identity of the descent of the last rollout.
     resident: Option<u64>,
 }
 
 impl TorchPlanner {
-    /// A planner of a model whose weights fit its configuration; on the processor it computes on so many threads.
+    /// A planner of a valid model; `threads` applies to the processor.
     pub fn new(model: &Model, device: Device, threads: usize) -> Self {
         let mut agent = Agent::new(model, device);
         agent.variables_mut().freeze();
@@ -88,7 +89,7 @@ impl Method for TorchPlanner {
 }
 
 impl TorchBlock {
-    /// Embeddings `[Z]` of at most R inputs.
+    /// Embeddings, `[Z]` each, of at most R inputs.
     fn encode(&self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         self.use_threads();
         let frames = self.padded(&tensors::from_observed(inputs));
@@ -97,31 +98,31 @@ impl TorchBlock {
         tensors::to_floats(&embeddings).chunks_exact(latent).map(<[f32]>::to_vec).collect()
     }
 
-    /// Rows on the device, with zeros up to R.
+    /// Rows on the device, padded with zeros to R.
     fn padded(&self, rows: &Tensor) -> Tensor {
         let missing = self.capacity as i64 - rows.size()[0];
         let mut padding = vec![0; 2 * rows.dim()];
-        // Dimensions count from the last, each with the room before and after it.
+        // Pairs of padding before and after each dimension, from the last dimension to the first.
         if let Some(after) = padding.last_mut() {
             *after = missing;
         }
         rows.to_device(self.device).constant_pad_nd(padding)
     }
 
-    /// Embeddings `[Z]` as `[R, Z]` on the device.
+    /// `count` embeddings, `[Z]` each, as `[R, Z]` on the device.
     fn stacked<'a>(&self, embeddings: impl Iterator<Item = &'a [f32]>, count: usize) -> Tensor {
         let rows: Vec<f32> = embeddings.flatten().copied().collect();
         self.padded(&Tensor::from_slice(&rows).view([count as i64, -1]))
     }
 
-    /// libtorch's number of threads belongs to the calling thread.
+    /// Sets libtorch's number of threads, a setting of the calling thread.
     fn use_threads(&self) {
         if !self.device.is_cuda() {
             tch::set_num_threads(self.threads as i32);
         }
     }
 
-    /// Numbers of a plan.
+    /// Number of elements of a plan, H A.
     fn plan_size(&self) -> usize {
         self.actions.len() / self.capacity
     }

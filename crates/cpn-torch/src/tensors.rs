@@ -1,4 +1,4 @@
-//! Conversion of plain numbers to tensors of libtorch and back.
+//! Conversion between plain numbers and tensors of libtorch.
 
 use cpn::archive;
 use cpn::method::{Frames, Observed};
@@ -20,10 +20,10 @@ pub fn from_positions(metres: &[[f32; 3]]) -> Tensor {
     Tensor::from_slice(metres.as_flattened()).view([-1, positions::SIZE])
 }
 
-/// All frames in one tensor.
+/// Frames as one tensor.
 ///
 /// # Panics
-/// If the bytes of images are not a whole, non-zero number of them.
+/// If the bytes are not a whole, non-zero number of images.
 pub fn from_frames(frames: &Frames) -> Tensor {
     match frames {
         Frames::Images(bytes) => from_images(bytes),
@@ -31,10 +31,10 @@ pub fn from_frames(frames: &Frames) -> Tensor {
     }
 }
 
-/// Observations of one kind in one tensor.
+/// Observations of one kind as one tensor.
 ///
 /// # Panics
-/// If there are none, or some of another kind.
+/// If there are none, or they are of different kinds.
 pub fn from_observed(inputs: &[Observed<'_>]) -> Tensor {
     let frames = match inputs[0] {
         Observed::Image(_) => Frames::Images(inputs.iter().flat_map(image).copied().collect()),
@@ -62,10 +62,10 @@ pub fn from_indices(indices: &[usize]) -> Tensor {
     Tensor::from_slice(&indices.iter().map(|index| *index as i64).collect::<Vec<_>>())
 }
 
-/// A tensor of an archive, of the type that it has there.
+/// A tensor of an archive, with its element type.
 ///
 /// # Panics
-/// If it has a type that archives of this project do not.
+/// If the type is not float32, float64, int64 or uint8.
 pub fn from_archive(tensor: &archive::Tensor) -> Tensor {
     let shape: Vec<i64> = tensor.shape().iter().map(|size| *size as i64).collect();
     let elements = tensor.elements::<f32>().map(|elements| Tensor::from_slice(&elements));
@@ -75,13 +75,13 @@ pub fn from_archive(tensor: &archive::Tensor) -> Tensor {
     elements.expect("numbers of 32 or 64 bits, or bytes").view(&shape[..])
 }
 
-/// A tensor as float32 in an archive.
+/// A tensor for an archive, as float32.
 pub fn to_archive(tensor: &Tensor) -> archive::Tensor {
     let shape: Vec<usize> = tensor.size().iter().map(|size| *size as usize).collect();
     archive::Tensor::new(&shape, &to_floats(tensor))
 }
 
-/// A tensor's numbers, row by row, as float32.
+/// A tensor's elements in row-major order, as float32.
 pub fn to_floats(tensor: &Tensor) -> Vec<f32> {
     let tensor = tensor.detach().to_device(Device::Cpu).to_kind(Kind::Float).flatten(0, -1).contiguous();
     Vec::try_from(tensor).expect("float32, in one row")

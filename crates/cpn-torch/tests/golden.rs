@@ -10,7 +10,7 @@ use cpn_torch::{Agent, tensors};
 use std::collections::BTreeMap;
 use tch::{Kind, Tensor};
 
-/// The agent with the reference's weights, in float64, and everything else the reference wrote.
+/// An agent with the reference's weights, in float64, and the other tensors of the reference.
 fn load(method: &str) -> (Agent, BTreeMap<String, Tensor>) {
     let path = format!("{}/../../tests/golden/{method}.safetensors", env!("CARGO_MANIFEST_DIR"));
     let (archive, config): (Tensors, ModelConfig) = archive::from_bytes(&std::fs::read(path).unwrap()).unwrap();

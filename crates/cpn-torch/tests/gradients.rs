@@ -1,4 +1,4 @@
-//! The hand-derived gradients of the outer loop and of the encoder against autograd, in float64.
+//! Hand-derived gradients of the outer loop and of the encoder against autograd, in float64.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -67,7 +67,7 @@ fn assert_close(config: &ModelConfig, name: &str, ours: &[f64], reference: &Tens
     }
 }
 
-/// What autograd left; zeros if nothing.
+/// The gradient by autograd; zeros for an unused variable.
 fn gradient(variable: &Tensor) -> Tensor {
     let gradient = variable.grad();
     if gradient.defined() { gradient } else { variable.zeros_like() }
@@ -87,13 +87,13 @@ fn agrees_with_autograd() {
     }
 }
 
-/// At full size a block's gates come in several parts; 33 outputs leave a smaller last one.
+/// At the paper's size a gate has several ranges; with 33 outputs the last one is smaller.
 #[test]
-fn gates_in_parts_agree_with_autograd() {
+fn gates_of_several_ranges_agree_with_autograd() {
     check(ModelConfig { horizon: 2, hidden: 33, ..ModelConfig::paper(MethodKind::Cpn) }, 20, 1);
 }
 
-/// Embeddings, and the gradient of a loss that is linear in them.
+/// Checks embeddings, and the gradient of a loss that is linear in them.
 fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
     let agent = new_agent(config.clone());
     let frames = match config.encoder.input() {
@@ -106,7 +106,7 @@ fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
 
     let variables = Named(agent.variables().variables());
     let mut encoder_pass = EncoderPass::<f64>::new(config.encoder.clone(), Precision::Float32, threads);
-    // Again, from what the passes before left.
+    // Twice, the second time with used tapes.
     for _ in 0..2 {
         let (embeddings, embedded) = encoder_pass.forward(&variables, frames.observed());
         assert_close(config, "embeddings", &embeddings, &reference);
@@ -123,7 +123,7 @@ fn check_encoder(config: &ModelConfig, rows: usize, threads: usize) {
 fn encoders_agree_with_autograd() {
     let mut large = small_config(MethodKind::Bc);
     if let EncoderConfig::Image(encoder) = &mut large.encoder {
-        // So many tiles in an image of the second that they are multiplied in several parts.
+        // The second convolution has enough tiles in an image for several products.
         let convolutions = [(5, 7, 2), (16, 4, 2)];
         encoder.convolutions =
             convolutions.map(|(channels, kernel, stride)| ConvConfig { channels, kernel, stride }).into();

@@ -1,4 +1,4 @@
-//! Training steps of every engine: the same descent, of libtorch's own optimiser, too.
+//! Training steps of all engines against those of autograd with libtorch's own optimiser.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -15,7 +15,7 @@ use testing::{noise_images, position_config, small_config, uniform};
 const RATE: f64 = 1e-3;
 const STEPS: usize = 5;
 
-/// Every engine of this machine.
+/// All engines of this machine.
 fn engines() -> Vec<Box<dyn Engine>> {
     let cuda = if Cuda::is_available() { vec![Some(0)] } else { Vec::new() };
     let torch =
@@ -51,18 +51,18 @@ fn training() -> Training {
     Training { max_gradient_norm: 1.0, ..Training::paper() }
 }
 
-/// The first of some weights that are farther than a tenth of a step from what they should be.
-fn far(ours: &Tensors, expected: &Tensors) -> Option<String> {
+/// Name of a weight that differs from the expected one by more than a tenth of a step.
+fn differing(ours: &Tensors, expected: &Tensors) -> Option<String> {
     let elements = |tensors: &Tensors, name: &str| tensors[name].elements::<f32>().unwrap();
-    let is_far = |name: &&String| {
+    let differs = |name: &&String| {
         let pairs = elements(ours, name).into_iter().zip(elements(expected, name));
         pairs.map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max) > 0.1 * RATE
     };
     assert_eq!(ours.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
-    expected.keys().find(is_far).cloned()
+    expected.keys().find(differs).cloned()
 }
 
-/// The descent by autograd and libtorch's Adam.
+/// Weights after training by autograd and libtorch's Adam.
 fn by_libtorch(model: &Model) -> Tensors {
     let agent = Agent::new(model, Device::Cpu);
     let mut adam = nn::Adam::default().build(agent.variables(), RATE).unwrap();
@@ -82,24 +82,24 @@ fn train(learner: &mut dyn Learner, steps: std::ops::Range<usize>) {
 }
 
 #[test]
-fn learners_descend_as_libtorchs_optimiser() {
+fn learners_agree_with_libtorchs_optimiser() {
     for config in configs() {
-        // As after some training: with initial weights an update leaps, and every rounding with it.
+        // A small step size, as after some training: large updates of the actions amplify rounding errors.
         let mut model = Model::new(config, 3);
         model.weights.insert("step_size".to_owned(), cpn::archive::Tensor::new(&[], &[0.01f32]));
         let expected = by_libtorch(&model);
-        assert!(far(&model.weights, &expected).is_some(), "weights move");
+        assert!(differing(&model.weights, &expected).is_some(), "weights move");
         for engine in engines() {
             let mut learner = engine.learner(model.clone(), &training()).unwrap();
             train(&mut *learner, 0..STEPS);
-            assert_eq!(far(&learner.model().weights, &expected), None, "{engine:?} {:?}", model.config);
+            assert_eq!(differing(&learner.model().weights, &expected), None, "{engine:?} {:?}", model.config);
         }
     }
 }
 
-/// A state that is restored goes on as the run that saved it, and an engine's state serves the others.
+/// Training from a restored state equals uninterrupted training; with another engine within rounding errors.
 #[test]
-fn a_restored_state_goes_on() {
+fn training_continues_from_a_restored_state() {
     let model = Model::new(small_config(MethodKind::Cpn), 3);
     let learner = |engine: &dyn Engine| engine.learner(model.clone(), &training()).unwrap();
     for engine in engines() {
@@ -114,7 +114,7 @@ fn a_restored_state_goes_on() {
             if format!("{engine:?}") == format!("{other:?}") {
                 assert_eq!(second.model(), whole.model(), "{engine:?}");
             } else {
-                assert_eq!(far(&second.model().weights, &whole.model().weights), None, "{engine:?} {other:?}");
+                assert_eq!(differing(&second.model().weights, &whole.model().weights), None, "{engine:?} {other:?}");
             }
         }
     }
@@ -145,7 +145,7 @@ fn a_loss_that_is_not_finite_is_refused() {
 }
 
 #[test]
-fn a_device_that_is_not_there_is_named() {
+fn a_missing_device_is_named() {
     let error = Torch::new(Some(99), 1).unwrap_err().to_string();
     assert!(error.starts_with("device: expected one of ") && error.ends_with("got cuda:99"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! The fast outer gradient, as it is trained with, against autograd.
+//! Outer loss and gradient of the native engine, in its training precisions, against autograd.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -10,7 +10,7 @@ use cpn_torch::loss::TensorBatch;
 use tch::{Device, Tensor};
 use testing::{noise_images, uniform};
 
-/// Eight samples of seven frames; some are observation and goal, and some are so more than once.
+/// Eight samples of seven frames; some frames are both observation and goal, some are used repeatedly.
 fn batch(config: &ModelConfig) -> Batch {
     let samples = 8 * config.horizon as usize;
     let floats = |count, seed| uniform(count, seed).into_iter().map(|value| value as f32);
@@ -23,14 +23,14 @@ fn batch(config: &ModelConfig) -> Batch {
     }
 }
 
-/// A model as after some training: with initial weights an update leaps, and every rounding with it.
+/// A model with a small step size, as after some training: large updates of the actions amplify rounding errors.
 fn model(method: MethodKind) -> Model {
     let mut model = Model::new(ModelConfig::paper(method), 3);
     model.weights.insert("step_size".to_owned(), Archived::new(&[], &[0.01f32]));
     model
 }
 
-/// Relative distances from autograd: of the loss, and of each weight's gradient by its length.
+/// Relative differences from autograd, of the loss and of each weight's gradient by its norm.
 fn distances(method: MethodKind, precision: Precision) -> Vec<(String, f64)> {
     let model = model(method);
     let agent = Agent::new(&model, Device::Cpu);
@@ -54,7 +54,7 @@ fn distances(method: MethodKind, precision: Precision) -> Vec<(String, f64)> {
 }
 
 #[test]
-fn in_float32_it_is_autograds() {
+fn float32_agrees_with_autograd() {
     for method in MethodKind::ALL {
         for (name, distance) in distances(method, Precision::Float32) {
             assert!(distance < 2e-4, "{method} {name}: {distance}");
@@ -62,9 +62,9 @@ fn in_float32_it_is_autograds() {
     }
 }
 
-/// bfloat16 has 8 bits, and units near their edge switch: of eight samples of noise, each gradient keeps to within a third.
+/// bfloat16 has 8 bits, and rectified linear units near 0 switch: on eight random samples the gradients agree within a third.
 #[test]
-fn in_bfloat16_it_is_close() {
+fn bfloat16_is_close_to_autograd() {
     for method in MethodKind::ALL {
         let distances = distances(method, Precision::Bfloat16);
         for (name, distance) in &distances {
@@ -74,9 +74,9 @@ fn in_bfloat16_it_is_close() {
     }
 }
 
-/// The sums of a batch do not depend on how often it is computed; those of several threads come close.
+/// Loss and gradient are bitwise reproducible for a number of threads, and nearly equal for different ones.
 #[test]
-fn it_repeats_bit_for_bit() {
+fn gradients_are_reproducible() {
     let model = Model::new(ModelConfig::paper(MethodKind::Cpn), 3);
     let batch = batch(&model.config);
     let differentiate =

@@ -1,4 +1,4 @@
-//! The mathematics of the networks, the inner loop and the outer loop.
+//! Mathematical properties of the networks, the inner loop and the outer loop.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -14,7 +14,7 @@ use tch::nn::{self, Module};
 use tch::{Device, Kind, Tensor};
 use testing::{position_config, small_config};
 
-/// Of float64, through the leaps of an untrained update.
+/// Tolerance of rounding errors in float64, amplified by an untrained model's large updates.
 const ROUNDING: f64 = 1e-9;
 
 fn max_difference(a: &Tensor, b: &Tensor) -> f64 {
@@ -33,8 +33,7 @@ fn batch(config: &ModelConfig, size: i64) -> TensorBatch {
     paired(&observations, &goals, &actions, &mask)
 }
 
-/// The outer gradient, which for planning methods is of second order, against central differences, at the largest
-/// components of every weight tensor.
+/// Outer gradients, of second order for planning methods, against central differences, at the largest components of each weight.
 #[test]
 fn outer_gradients_match_finite_differences() {
     let methods = MethodKind::ALL.into_iter();
@@ -44,12 +43,14 @@ fn outer_gradients_match_finite_differences() {
         let batch = batch(agent.config(), 3);
         let loss = || agent.outer_loss(&batch);
         loss().backward();
+
         let mut seen = 0;
         for (name, variable) in agent.variables().variables() {
             if !variable.grad().defined() {
                 assert_eq!(name, "step_size", "{method}: every other weight takes part");
                 continue;
             }
+
             let gradient = variable.grad().view(-1);
             let index = gradient.abs().argmax(None, false).int64_value(&[]);
             let mut weight = variable.detach().view(-1).get(index);
@@ -59,6 +60,7 @@ fn outer_gradients_match_finite_differences() {
                 weight -= delta;
                 value
             };
+
             let numeric = (nudged(1e-6) - nudged(-1e-6)) / 2e-6;
             let analytic = gradient.double_value(&[index]);
             assert!(
@@ -98,7 +100,7 @@ fn a_plan_does_not_depend_on_its_batch() {
 }
 
 #[test]
-fn training_and_serving_plan_alike() {
+fn plans_of_training_and_serving_are_equal() {
     let agent = new_agent(small_config(MethodKind::Cpn));
     let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
     let inner_loop = InnerLoop { updates: 3, ..agent.inner_loop() };
@@ -136,9 +138,9 @@ fn a_small_update_lowers_the_inner_loss() {
     }
 }
 
-/// With attenuation forced to 1 everywhere the layer is an ordinary linear one.
+/// With all attenuation factors set to 1, the layer is an ordinary linear one.
 #[test]
-fn an_open_neuromodulated_layer_is_linear() {
+fn a_layer_without_attenuation_is_linear() {
     let mut store = nn::VarStore::new(Device::Cpu);
     let layer = Neuromodulated::new(&(store.root() / "layer"), 5, 3, 4);
     store.double();
@@ -154,7 +156,7 @@ fn an_open_neuromodulated_layer_is_linear() {
 }
 
 #[test]
-fn each_method_sees_what_it_should() {
+fn methods_depend_on_the_goal_as_configured() {
     for method in MethodKind::ALL {
         let agent = new_agent(small_config(method));
         let [x, goal_a, goal_b] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
@@ -176,7 +178,7 @@ fn steps_past_the_demonstration_do_not_count() {
     assert!((loss() - before).abs() < 1e-12);
 }
 
-/// The same place, told from two origins and in two units, is the same to the encoder.
+/// The encoder is invariant to a common change of origin and scale of positions and configuration.
 #[test]
 fn positions_are_standardised() {
     let embed = |centre_mm, scale_mm, position| {

@@ -1,4 +1,4 @@
-//! Plans of every engine against the reference by autograd, and the properties of searches.
+//! Plans of all engines against the reference by autograd, and properties of searches.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -16,15 +16,15 @@ use proptest::prelude::*;
 use tch::{Cuda, Device, Kind, Tensor};
 use testing::{encoders, noise_images, position_config, small_config};
 
-/// Relative, of float32 against float64.
+/// Relative tolerance of float32 against float64.
 const TOLERANCE: f64 = 1e-5;
-/// Move of embeddings of about 1, by some of float32's last places, to see how a plan moves with them.
+/// Perturbation of embeddings of magnitude 1, a few units in float32's last place, to measure a plan's sensitivity.
 const ROUNDING: f64 = 1e-6;
-/// Number of directions of such moves.
+/// Number of directions of perturbation.
 const DIRECTIONS: u64 = 32;
 const SAMPLERS: [Solver; 3] = [Solver::Cem(40), Solver::Mppi(40), Solver::Hybrid(40)];
 
-/// Every engine of this machine, on one thread and on three.
+/// All engines of this machine; the native one on one thread and on three.
 fn engines() -> Vec<Box<dyn Engine>> {
     let native = [1, 3].map(|threads| Box::new(Native { threads }) as Box<dyn Engine>);
     let cuda = if Cuda::is_available() { vec![Some(0)] } else { Vec::new() };
@@ -33,8 +33,8 @@ fn engines() -> Vec<Box<dyn Engine>> {
     native.into_iter().chain(torch).collect()
 }
 
-/// True for the native engine, whose plans and embeddings are the same in every bit wherever they stand in a batch; libtorch's are
-/// so for sizes that fill its kernels' registers.
+/// True for the native engine, whose plans and embeddings are bit for bit independent of their position in a batch; libtorch's are
+/// so only for sizes that fill its kernels' registers.
 fn is_native(engine: &dyn Engine) -> bool {
     format!("{engine:?}").starts_with("Native")
 }
@@ -43,7 +43,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
     Vec::try_from(tensor.to_kind(Kind::Double).flatten(0, -1)).unwrap()
 }
 
-/// A model with this step size.
+/// A model with the inner loop's step size set.
 fn model(config: ModelConfig, step_size: f32) -> Model {
     let mut model = Model::new(config, 3);
     model.weights.insert("step_size".to_owned(), Archived::new(&[], &[step_size]));
@@ -54,7 +54,7 @@ fn planner(engine: &dyn Engine, model: &Model) -> Box<dyn Method> {
     engine.planner(model, Precision::Float32).unwrap()
 }
 
-/// Rows `[Z]` of float32, and the same numbers as `[B, Z]`.
+/// Random embeddings: rows `[Z]` in float32, and the same values as a tensor `[B, Z]` in float64.
 fn embeddings(rows: usize, latent: i64, seed: u64) -> (Vec<Vec<f32>>, Tensor) {
     let values = (uniform(&[rows as i64, latent], seed) * 1.5).to_kind(Kind::Float);
     let row = |row| floats(&values.get(row)).into_iter().map(|value| value as f32).collect();
@@ -70,7 +70,7 @@ fn fixed<'a>(solver: Solver, count: usize) -> Search<'a> {
     Search { solver, iterations: Iterations::Fixed(count) }
 }
 
-/// As close to the float64 numbers as float32 ones can be, where what they are computed from moves them by `rounding`.
+/// Asserts that float32 values equal the float64 reference within the tolerance and their sensitivity to `rounding`.
 fn assert_close(what: &str, ours: impl Iterator<Item = f32>, reference: &[f64], rounding: f64) {
     let scale = reference.iter().fold(1.0f64, |most, value| most.max(value.abs()));
     let ours: Vec<f32> = ours.collect();
@@ -100,18 +100,18 @@ fn sizes() -> impl Strategy<Value = ModelConfig> {
     )
 }
 
-/// The same plans again, `[2 DIRECTIONS B]`, from beginnings that are moved by about what float32 rounds along a computation:
-/// how far a plan moves is how far float32 may. A rollout can be steep, and the gradient jumps where a rectified linear unit
-/// opens. Each direction is taken both ways, so that one of them opens what rounding may open.
-fn moved(agent: &Agent, x: &Tensor, x_g: &Tensor) -> TensorPlan {
+/// Plans from perturbed embeddings, `[2 DIRECTIONS B]`: their differences from the plan bound the effect of rounding in float32. A
+/// rollout can be steep, and the gradient is discontinuous where a rectified linear unit switches; each direction is taken with
+/// both signs, so that one of them switches the units that rounding may switch.
+fn perturbed(agent: &Agent, x: &Tensor, x_g: &Tensor) -> TensorPlan {
     let around = |tensor: &Tensor, seed: u64| {
-        let moves = (0..DIRECTIONS).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);
-        Tensor::cat(&moves.flat_map(|by| [tensor + &by, tensor - by]).collect::<Vec<_>>(), 0)
+        let perturbations = (0..DIRECTIONS).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);
+        Tensor::cat(&perturbations.flat_map(|by| [tensor + &by, tensor - by]).collect::<Vec<_>>(), 0)
     };
     agent.plan(&around(x, 0), &around(x_g, 1))
 }
 
-/// The actions and the inner losses of a plan of a batch.
+/// Actions and inner losses of a batch's plan.
 fn parts(plan: &TensorPlan, row: usize) -> [Vec<f64>; 2] {
     let losses = plan.inner_losses.iter().map(|losses| losses.double_value(&[row as i64]));
     [floats(&plan.actions.get(row as i64)), losses.collect()]
@@ -127,7 +127,8 @@ proptest! {
         let agent = double_agent(&model);
         let ((x, xs), (x_g, x_gs)) = (embeddings(rows, latent, seed), embeddings(rows, latent, seed + 1));
         let reference = agent.plan(&xs, &x_gs);
-        let others = moved(&agent, &xs, &x_gs);
+        let others = perturbed(&agent, &xs, &x_gs);
+
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
             let plans = planner.plan(&queries(&x, &x_g, &[]), &mut fixed(Solver::Gradient, updates));
@@ -161,7 +162,7 @@ proptest! {
         let model = model(config, 1.0);
         let images = noise_images(rows, seed);
         let reference = double_agent(&model).encode(&tensors::from_images(&images));
-        // Where features hardly differ, their normalisation magnifies the last places, libtorch's as ours.
+        // Layer normalisation of nearly equal values amplifies rounding errors, in libtorch as in the native engine.
         let single = Agent::new(&model, Device::Cpu).encode(&tensors::from_images(&images));
         let rounding = farthest(&floats(&single), &floats(&reference));
         for engine in engines() {
@@ -203,7 +204,7 @@ fn embeddings_are_those_of_autograd() {
     }
 }
 
-/// And, as others, the same in every bit alone or among others.
+/// They are also bit for bit independent of the rest of the batch.
 #[test]
 fn embeddings_in_bfloat16_are_close() {
     let model = Model::new(ModelConfig::paper(MethodKind::Cpn), 0);
@@ -219,16 +220,16 @@ fn embeddings_in_bfloat16_are_close() {
 }
 
 #[test]
-fn positions_stay_whole_in_bfloat16() {
+fn positions_are_not_rounded_to_bfloat16() {
     let model = Model::new(Preset::Jenga.recipe().model, 0);
     let [whole, coarse] = [Precision::Float32, Precision::Bfloat16]
         .map(|precision| Planner::new(&model, precision, 1).encode(&[Observed::Position([0.4, -0.2, 0.1])]));
     assert_eq!(whole, coarse);
 }
 
-/// In every bit, whatever the batch and the solver, and of the native engine whatever the threads.
+/// Bit for bit, for all batches and solvers; for the native engine also for all numbers of threads.
 #[test]
-fn a_plan_does_not_depend_on_its_company() {
+fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
     for method in [MethodKind::Cpn, MethodKind::Upn, MethodKind::TeBc] {
         let config = ModelConfig { updates: if method.plans() { 2 } else { 0 }, ..ModelConfig::paper(method) };
         let (latent, plans) = (config.encoder.latent(), method.plans());
@@ -236,6 +237,7 @@ fn a_plan_does_not_depend_on_its_company() {
         let ((x, _), (x_g, _)) = (embeddings(45, latent, 1), embeddings(45, latent, 2));
         let together = queries(&x, &x_g, &[]);
         let images = noise_images(5, 3);
+
         let mut by_native = planner(&Native { threads: 1 }, &model);
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
@@ -250,6 +252,7 @@ fn a_plan_does_not_depend_on_its_company() {
                     assert_eq!(all, native, "{engine:?} {method} {solver:?}");
                 }
             }
+
             let frames = observed(&images);
             let all = planner.encode(&frames);
             for (frame, x) in frames.iter().zip(&all) {
@@ -259,7 +262,7 @@ fn a_plan_does_not_depend_on_its_company() {
     }
 }
 
-/// The same samples, and losses within rounding: searches of all engines end at the same plan, unless two candidates tie.
+/// With the same samples, and losses equal within rounding errors, searches of all engines find the same plan, except for ties.
 #[test]
 fn engines_find_the_same_plans() {
     let config = ModelConfig::paper(MethodKind::Cpn);
@@ -285,14 +288,14 @@ fn search(planner: &mut dyn Method, solver: Solver, iterations: Iterations<'_>, 
     planner.plan(&queries(&x, &x_g, start), &mut Search { solver, iterations }).remove(0)
 }
 
-/// A planner of a small model with this step size, by each engine.
+/// A planner of a small model by each engine, with the inner loop's step size set.
 fn planners(step_size: f32) -> impl Iterator<Item = Box<dyn Method>> {
     let model = model(small_config(MethodKind::Cpn), step_size);
     engines().into_iter().map(move |engine| planner(&*engine, &model))
 }
 
 #[test]
-fn samplers_find_better_plans_and_the_same_again() {
+fn samplers_improve_plans_and_are_reproducible() {
     for mut planner in planners(0.1) {
         let planner = &mut *planner;
         for solver in SAMPLERS {
@@ -307,7 +310,7 @@ fn samplers_find_better_plans_and_the_same_again() {
 }
 
 #[test]
-fn a_search_goes_on_while_it_may_and_answers_the_best() {
+fn an_open_ended_search_returns_the_best_plan() {
     for mut planner in planners(40.0) {
         let planner = &mut *planner;
         for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
@@ -330,14 +333,15 @@ fn a_search_goes_on_while_it_may_and_answers_the_best() {
     }
 }
 
-/// The same bits, in whatever pieces, on however many threads, with other work in the same memory between any two pieces.
+/// Bit for bit, for all divisions into pieces and numbers of threads, with other searches in the same memory between pieces.
 #[test]
-fn a_search_in_pieces_is_that_in_one() {
+fn a_search_in_pieces_equals_one_in_a_single_piece() {
     let ((x, _), (x_g, _)) = (embeddings(2, 6, 1), embeddings(2, 6, 2));
     for (mut planner, start) in planners(40.0).zip([false, true, true, false]) {
         let planner = &mut *planner;
         let start = if start { search(planner, Solver::Cem(40), Iterations::Fixed(1), &[]).actions } else { vec![] };
         let queries = queries(&x, &x_g, &start);
+
         for solver in [Solver::Gradient].into_iter().chain(SAMPLERS) {
             let whole = planner.plan(&queries[..1], &mut fixed(solver, 5)).remove(0);
             for pieces in [1, 2, 1000] {
@@ -362,16 +366,17 @@ fn a_search_in_pieces_is_that_in_one() {
     }
 }
 
-/// Those that are searched for together do not notice when one of them is left out.
+/// Removal of a query from a search does not affect the others.
 #[test]
-fn a_search_goes_on_without_those_that_have_left() {
+fn a_search_continues_without_removed_queries() {
     for (engine, mut planner) in engines().into_iter().zip(planners(0.5)) {
         let is_native = is_native(&*engine);
         let ((x, _), (x_g, _)) = (embeddings(7, 6, 1), embeddings(7, 6, 2));
         let mut queries = queries(&x, &x_g, &[]);
         let mut expected = planner.plan(&queries, &mut fixed(Solver::Gradient, 9));
+
         let mut ongoing = Ongoing::new(Solver::Gradient, 9, false);
-        // One of three threads has nothing left in the end.
+        // In the end one of three threads has no query left.
         for gone in [6, 2, 4, 0, 0] {
             planner.resume(&queries, &mut ongoing, &mut || false);
             queries.remove(gone);
@@ -381,6 +386,7 @@ fn a_search_goes_on_without_those_that_have_left() {
         while !ongoing.is_over() {
             planner.resume(&queries, &mut ongoing, &mut || true);
         }
+
         let numbers = |plans: &[Plan]| {
             let all = plans.iter().flat_map(|plan| plan.actions.iter().flatten());
             all.map(|number| f64::from(*number)).collect::<Vec<_>>()
@@ -394,9 +400,9 @@ fn a_search_goes_on_without_those_that_have_left() {
     }
 }
 
-/// A search that is left for good answers the best plan of what it has done whole, as one of so many iterations does.
+/// An abandoned search returns the best plan of its complete iterations, equal to that of a search with as many iterations.
 #[test]
-fn a_search_that_is_left_answers_the_best_so_far() {
+fn an_abandoned_search_returns_the_best_plan_so_far() {
     for mut planner in planners(40.0) {
         let planner = &mut *planner;
         let ((x, _), (x_g, _)) = (embeddings(1, 6, 1), embeddings(1, 6, 2));

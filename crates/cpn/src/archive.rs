@@ -1,4 +1,4 @@
-//! Named tensors and one JSON document in a safetensors file.
+//! Archives: safetensors files of named tensors and one JSON document.
 
 use crate::unique;
 use bytemuck::Pod;
@@ -27,7 +27,7 @@ pub struct Tensor {
     bytes: Vec<u8>,
 }
 
-/// Types of tensor elements.
+/// Element type of a tensor.
 pub trait Scalar: Pod {
     /// The type's name in safetensors.
     const DTYPE: Dtype;
@@ -50,10 +50,10 @@ impl Scalar for u8 {
 }
 
 impl Tensor {
-    /// A tensor of these elements.
+    /// A tensor of `elements` in row-major order.
     ///
     /// # Panics
-    /// If their number is not that of the shape.
+    /// If the number of elements differs from the product of the shape.
     pub fn new<T: Scalar>(shape: &[usize], elements: &[T]) -> Self {
         assert_eq!(shape.iter().product::<usize>(), elements.len(), "elements of a tensor of shape {shape:?}");
         Self { dtype: T::DTYPE, shape: shape.to_vec(), bytes: bytemuck::cast_slice(elements).to_vec() }
@@ -69,16 +69,16 @@ impl Tensor {
         &self.shape
     }
 
-    /// The elements, row by row; none if they are of another type.
+    /// The elements in row-major order; `None` if they are of another type.
     pub fn elements<T: Scalar>(&self) -> Option<Vec<T>> {
         (self.dtype == T::DTYPE).then(|| bytemuck::pod_collect_to_vec(&self.bytes))
     }
 }
 
-/// Serialises tensors with a document about them. The same contents give the same bytes.
+/// Serialises tensors and a document. Equal contents give equal bytes.
 ///
 /// # Errors
-/// If the document has no JSON form.
+/// If the document cannot be represented as JSON.
 pub fn to_bytes<M: Serialize>(tensors: &Tensors, metadata: &M) -> Result<Vec<u8>, ArchiveError> {
     let json = serde_json::to_string(metadata).map_err(|e| ArchiveError(e.to_string()))?;
     let views = tensors
@@ -90,26 +90,29 @@ pub fn to_bytes<M: Serialize>(tensors: &Tensors, metadata: &M) -> Result<Vec<u8>
     Ok(safetensors::serialize(views, Some(HashMap::from([(METADATA_KEY.to_owned(), json)])))?)
 }
 
-/// Reads the bytes of [`to_bytes`].
+/// Deserialises the bytes of [`to_bytes`].
 ///
 /// # Errors
 /// If the file is truncated or malformed, its header is too long, or it lacks a valid document.
 pub fn from_bytes<M: DeserializeOwned>(bytes: &[u8]) -> Result<(Tensors, M), ArchiveError> {
     let header_bytes = bytes.first_chunk().map_or(0, |length| u64::from_le_bytes(*length));
     if header_bytes > MAX_HEADER_BYTES {
-        // The number is left out: of a file of another kind it would be its first bytes.
+        // Without the length: in a file of another format it is an arbitrary number.
         return Err(ArchiveError(format!("header: expected at most {MAX_HEADER_BYTES} bytes, got more")));
     }
+
     let (_, header) = SafeTensors::read_metadata(bytes)?;
     let json = header
         .metadata()
         .as_ref()
         .and_then(|metadata| metadata.get(METADATA_KEY))
         .ok_or_else(|| ArchiveError(format!("metadata: expected the key \"{METADATA_KEY}\", got none")))?;
-    // The library has found the header whole.
+
+    // `read_metadata` has checked that the header is complete.
     let header = bytes.get(size_of::<u64>()..).and_then(|rest| rest.get(..header_bytes as usize)).unwrap_or_default();
     unique::check(header).map_err(|e| ArchiveError(format!("header: {e}")))?;
     unique::check(json.as_bytes()).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
+
     let document = serde_json::from_str(json).map_err(|e| ArchiveError(format!("metadata: {e}")))?;
     let file = SafeTensors::deserialize(bytes)?;
     let tensor = |view: &TensorView<'_>| Tensor {

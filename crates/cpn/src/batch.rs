@@ -2,7 +2,7 @@
 
 use crate::observation::Frames;
 
-/// Samples of a training step. B is their number, F that of their distinct frames.
+/// Samples of a training step: B samples of F distinct frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Batch {
     /// The distinct images or positions, F.
@@ -11,7 +11,7 @@ pub struct Batch {
     pub observations: Vec<usize>,
     /// Index of each sample's goal among the frames, `[B]`.
     pub goals: Vec<usize>,
-    /// The demonstrated actions that follow, `[B, H, A]`; 0 past the demonstration's end.
+    /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Vec<f32>,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Vec<f32>,

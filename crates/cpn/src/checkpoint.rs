@@ -1,4 +1,4 @@
-//! Checkpoints: weights, with everything needed to rebuild and to trace the model in the file's metadata.
+//! Checkpoints: safetensors files of weights, with the model's configuration and provenance in the metadata.
 
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
@@ -9,24 +9,24 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-/// Largest checkpoint that is read, in bytes.
+/// Maximum size of a checkpoint, in bytes.
 pub const MAX_BYTES: usize = 64 << 20;
-/// Version of the metadata; another one is refused.
+/// Version of the metadata; other versions are refused.
 const FORMAT: u32 = 3;
 
-/// Where a model comes from.
+/// Provenance of a model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
-    /// Tasks whose demonstrations it was trained on.
+    /// Tasks of the training episodes.
     pub training_tasks: Vec<String>,
     /// SHA-256 over the digests of the training episodes, in hex.
     pub data_digest: String,
-    /// How the training frames were rendered, as the simulator's JSON; empty if their origin is unknown.
+    /// Render spec of the training frames, as the simulator's JSON; empty if unknown.
     pub render_spec: String,
     /// Seed of initialisation and sampling.
     pub seed: u64,
-    /// How it was trained.
+    /// Training settings.
     pub training: Training,
 }
 
@@ -38,56 +38,59 @@ struct Metadata {
     provenance: Provenance,
 }
 
-/// A loaded model.
+/// A checkpoint that was read: a model with its provenance and digests.
 #[derive(Debug)]
 pub struct Checkpoint {
     /// Configuration and weights.
     pub model: Model,
-    /// Where it comes from.
+    /// Provenance of the model.
     pub provenance: Provenance,
     /// SHA-256 of the checkpoint's bytes, in hex.
     pub digest: String,
-    /// SHA-256 of the configuration's JSON, as it stands in the metadata, in hex.
+    /// SHA-256 of the configuration's JSON in the metadata, in hex.
     pub config_digest: String,
 }
 
 impl Checkpoint {
-    /// Digests of what the model was made from: that of the demonstrations, if it is known.
+    /// Digests of the model's inputs: that of the demonstrations, if it is known.
     pub fn parents(&self) -> Vec<String> {
         Some(self.provenance.data_digest.clone()).filter(|digest| !digest.is_empty()).into_iter().collect()
     }
 }
 
-/// Serialises a model; the same weights give the same bytes.
+/// Serialises a model. Equal contents give equal bytes.
 ///
 /// # Errors
-/// If the weights cannot be represented.
+/// If the metadata cannot be represented as JSON, or the weights as safetensors.
 pub fn to_bytes(model: &Model, provenance: &Provenance) -> Result<Vec<u8>, ArchiveError> {
     let metadata = Metadata { format: FORMAT, model: model.config.clone(), provenance: provenance.clone() };
     archive::to_bytes(&model.weights, &metadata)
 }
 
-/// Rebuilds a model from a stranger's bytes.
+/// Reads and validates a checkpoint; the bytes need not be trusted.
 ///
 /// # Errors
-/// Says what is wrong with the file: size, format, configuration, or a tensor that is missing, unknown, of the wrong
-/// shape or type, or not finite.
+/// If the size, the format or the configuration is invalid, or a tensor is missing, unknown, of the wrong shape or type, or not
+/// finite.
 pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     if bytes.len() > MAX_BYTES {
         return Err(CheckpointError::TooLarge { got: bytes.len() });
     }
-    // The version first: another one's metadata has other fields.
+
+    // The version first: metadata of other versions have other fields.
     let (tensors, document): (_, Value) = archive::from_bytes(bytes)?;
     if document["format"] != FORMAT {
         let got = document["format"].as_u64().map_or_else(|| "no number".to_owned(), |format| format.to_string());
         return Err(CheckpointError::Format { got });
     }
+
     let metadata: Metadata = serde_json::from_value(document).map_err(CheckpointError::Metadata)?;
     metadata.model.validate()?;
     let render_spec = &metadata.provenance.render_spec;
     if !render_spec.is_empty() {
         unique::check(render_spec.as_bytes()).map_err(CheckpointError::RenderSpec)?;
     }
+
     let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
     check_weights(&tensors, &metadata.model)?;
     let model = Model { config: metadata.model, weights: tensors };
@@ -95,21 +98,19 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     Ok(Checkpoint { model, provenance: metadata.provenance, digest, config_digest })
 }
 
-/// SHA-256 of bytes, in hex: how checkpoints are named.
+/// SHA-256 of bytes, in hex: the identity of a checkpoint.
 pub fn digest(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// Checks that tensors are the weights of a valid configuration.
-///
-/// # Errors
-/// If they are not exactly these in name, shape and type, or not finite.
+/// Checks that tensors are the weights of a valid configuration, exactly in name, shape and type, and finite.
 fn check_weights(tensors: &Tensors, config: &ModelConfig) -> Result<(), CheckpointError> {
     let parameters = model::parameters(config);
     let is_known = |name: &String| parameters.iter().any(|parameter| parameter.name == *name);
     if let Some(name) = tensors.keys().find(|name| !is_known(name)) {
         return Err(CheckpointError::UnknownTensor { name: name.clone() });
     }
+
     for Parameter { name, shape, .. } in parameters {
         let Some(tensor) = tensors.get(&name) else { return Err(CheckpointError::MissingTensor { name }) };
         match tensor.elements::<f32>().filter(|_| tensor.shape() == shape) {
@@ -124,40 +125,40 @@ fn check_weights(tensors: &Tensors, config: &ModelConfig) -> Result<(), Checkpoi
     Ok(())
 }
 
-/// Why a checkpoint was refused.
+/// Fault of a refused checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// More bytes than are ever read.
+    /// More bytes than [`MAX_BYTES`].
     #[error("checkpoint: expected at most {MAX_BYTES} bytes, got {got}")]
     TooLarge {
-        /// Size that came, in bytes.
+        /// Size of the checkpoint, in bytes.
         got: usize,
     },
-    /// Not a well-formed archive.
+    /// A malformed archive.
     #[error("checkpoint: {0}")]
     Unreadable(#[from] ArchiveError),
-    /// Written by another version of this crate.
+    /// Another version of the metadata.
     #[error("checkpoint format: expected {FORMAT}, got {got}")]
     Format {
-        /// Format that came.
+        /// Format in the file.
         got: String,
     },
-    /// Metadata that lack a field or have an unknown one.
+    /// Metadata with a missing, unknown or invalid field.
     #[error("checkpoint metadata: {0}")]
     Metadata(serde_json::Error),
-    /// A description of how the frames were rendered that is no JSON.
+    /// A render spec that is not JSON.
     #[error("checkpoint provenance.render_spec: expected nothing or JSON, got {0}")]
     RenderSpec(serde_json::Error),
     /// A configuration out of range.
     #[error("checkpoint model: {0}")]
     Config(#[from] ConfigError),
-    /// A weight that the configuration asks for is not in the file.
+    /// A weight of the configuration that is missing in the file.
     #[error("checkpoint tensor \"{name}\": expected by the model's configuration, got none")]
     MissingTensor {
         /// The weight's name.
         name: String,
     },
-    /// The file holds a tensor that the configuration does not know.
+    /// A tensor in the file that is not part of the configuration.
     #[error("checkpoint tensor \"{name}\": not part of the model's configuration")]
     UnknownTensor {
         /// The tensor's name.

@@ -1,9 +1,9 @@
-//! What a model is made of: sizes, method, presets.
+//! Configuration of a model: method, encoder, sizes.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Farthest that a position may lie from the origin: 1 km, in millimetres.
+/// Maximum distance of a position from the origin on each axis: 1 km, in millimetres.
 const MAX_MM: i64 = 1_000_000;
 
 /// A learned method of the paper's comparison (section "Methods for comparison").
@@ -14,9 +14,9 @@ pub enum MethodKind {
     Bc,
     /// Behaviour cloning conditioned on the goal's embedding.
     TeBc,
-    /// Universal planning network: plans, without goal conditioning or neuromodulation.
+    /// Universal planning network: planning, without goal conditioning or neuromodulation.
     Upn,
-    /// Contextual planning network: plans, conditioned on the goal's embedding, with neuromodulated layers.
+    /// Contextual planning network: planning, conditioned on the goal's embedding, with neuromodulated layers.
     Cpn,
 }
 
@@ -24,22 +24,22 @@ impl MethodKind {
     /// Every learned method, in the paper's order.
     pub const ALL: [Self; 4] = [Self::Bc, Self::TeBc, Self::Upn, Self::Cpn];
 
-    /// Whether g_θ sees the goal's embedding.
+    /// True if the goal's embedding is an input of g_θ.
     pub fn is_goal_conditioned(self) -> bool {
         matches!(self, Self::TeBc | Self::Cpn)
     }
 
-    /// Whether actions come from the inner loop.
+    /// True if actions come from the inner loop.
     pub fn plans(self) -> bool {
         matches!(self, Self::Upn | Self::Cpn)
     }
 
-    /// Whether the fully connected layers of g_θ are neuromodulated.
+    /// True if the fully connected layers of g_θ are neuromodulated.
     pub fn is_neuromodulated(self) -> bool {
         self == Self::Cpn
     }
 
-    /// The name used in configuration, on the wire and in tables.
+    /// Name in configuration, on the wire and in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Bc => "bc",
@@ -74,7 +74,7 @@ impl ConvConfig {
     }
 }
 
-/// What observations and goals are.
+/// Kind of observations and goals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Input {
     /// Camera images, 84 x 84.
@@ -83,7 +83,7 @@ pub enum Input {
     Position,
 }
 
-/// The encoder f_φ, by what observations and goals are.
+/// Encoder f_φ, by the kind of observations and goals.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum EncoderConfig {
@@ -97,11 +97,11 @@ pub enum EncoderConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageEncoderConfig {
-    /// Convolutions from the image on.
+    /// Convolutions, in the order of evaluation.
     pub convolutions: Vec<ConvConfig>,
     /// Z, the size of the embedding.
     pub latent: i64,
-    /// Whether the embedding is layer-normalised, which keeps the inner loss on one scale.
+    /// True if the embedding is layer-normalised, which keeps the inner loss on one scale.
     pub layer_norm: bool,
 }
 
@@ -109,21 +109,21 @@ pub struct ImageEncoderConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PositionEncoderConfig {
-    /// What is subtracted from a position, x, y, z. Whole millimetres, which JSON keeps exactly.
+    /// Offset subtracted from a position, x, y, z, in millimetres: integers, which JSON represents exactly.
     pub centre_mm: [i64; 3],
-    /// What the rest is divided by: one scale, so that space keeps its shape.
+    /// Divisor of the difference, in millimetres: one for all axes, so that ratios of distances are preserved.
     pub scale_mm: i64,
     /// Widths of the linear layers before the last, each followed by a rectified linear unit.
     pub layers: Vec<i64>,
     /// Z, the size of the embedding.
     pub latent: i64,
-    /// Whether the embedding is layer-normalised.
+    /// True if the embedding is layer-normalised.
     pub layer_norm: bool,
 }
 
 impl EncoderConfig {
-    /// Our reading of the paper's encoder, whose widths stand only in a figure: the three convolutions customary for
-    /// 84×84 images, and a latent of 64.
+    /// Our reading of the paper's encoder, whose widths are given only in a figure: the three convolutions customary for 84×84
+    /// images, and a latent of 64.
     pub fn paper() -> Self {
         Self::Image(ImageEncoderConfig {
             convolutions: vec![ConvConfig::new(32, 8, 4), ConvConfig::new(64, 4, 2), ConvConfig::new(64, 3, 1)],
@@ -132,13 +132,14 @@ impl EncoderConfig {
         })
     }
 
-    /// Our encoder of positions that lie about `centre_mm`, `scale_mm` from it or so: the paper tells nothing of its own.
+    /// Our encoder of positions with mean `centre_mm` and standard deviation `scale_mm`, in millimetres: the paper does not
+    /// describe its own.
     pub fn position(centre_mm: [i64; 3], scale_mm: i64) -> Self {
         let layers = vec![64];
         Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 16, layer_norm: true })
     }
 
-    /// What it embeds.
+    /// Kind of observations that it embeds.
     pub fn input(&self) -> Input {
         match self {
             Self::Image(_) => Input::Image,
@@ -154,7 +155,7 @@ impl EncoderConfig {
         }
     }
 
-    /// Whether the embedding is layer-normalised.
+    /// True if the embedding is layer-normalised.
     pub fn layer_norm(&self) -> bool {
         match self {
             Self::Image(image) => image.layer_norm,
@@ -189,7 +190,7 @@ impl EncoderConfig {
 }
 
 impl ImageEncoderConfig {
-    /// Width and height in pixels after the last convolution; `None` if the image is used up before.
+    /// Width and height after the last convolution, in pixels; `None` if an input is smaller than its kernel.
     pub fn output_size(&self) -> Option<i64> {
         self.convolutions.iter().try_fold(crate::images::SIZE, |size, conv| {
             (size >= conv.kernel).then(|| (size - conv.kernel) / conv.stride + 1)
@@ -197,13 +198,13 @@ impl ImageEncoderConfig {
     }
 }
 
-/// Everything that decides the shape and the planning of a model; stored whole in its checkpoint.
+/// Configuration of a model's architecture and planning, stored in its checkpoint.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
-    /// Which of the compared methods this is.
+    /// Method of the comparison.
     pub method: MethodKind,
-    /// The encoder f_φ.
+    /// Encoder f_φ.
     pub encoder: EncoderConfig,
     /// Width of the internal linear layers of g_θ.
     pub hidden: i64,
@@ -218,17 +219,17 @@ pub struct ModelConfig {
 }
 
 impl ModelConfig {
-    /// The paper's values: layers 32 wide, 4 actions, H = 5, U = 1.
+    /// The paper's values: layers of width 32, 4 actions, H = 5, U = 1.
     pub fn paper(method: MethodKind) -> Self {
         let (horizon, updates) = if method.plans() { (5, 1) } else { (1, 0) };
         Self { method, encoder: EncoderConfig::paper(), hidden: 32, gate_hidden: 32, actions: 4, horizon, updates }
     }
 
-    /// Checks every value against its range, so that a model can be built from a stranger's file: no valid model has more
-    /// than a few hundred megabytes of weights.
+    /// Checks every value against its range. The ranges bound a model's weights to a few hundred megabytes, so that a model can be
+    /// built from an untrusted file.
     ///
     /// # Errors
-    /// Names the first field out of its range, what was expected and what came.
+    /// The first field out of its range, with the range and the value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.encoder.validate()?;
         in_range("hidden", self.hidden, 1, 256)?;
@@ -248,17 +249,17 @@ pub(crate) fn in_range(field: &'static str, value: i64, min: i64, max: i64) -> R
     if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError::new(field, value, min, max)) }
 }
 
-/// A configuration value out of its range.
+/// Error of a configuration value out of its range.
 #[derive(Debug, thiserror::Error)]
 #[error("{field}: expected {min} to {max}, got {value}")]
 pub struct ConfigError {
-    /// The field at fault.
+    /// Path of the field.
     pub field: &'static str,
-    /// What came.
+    /// The invalid value.
     pub value: String,
-    /// Smallest allowed value.
+    /// Minimum.
     pub min: String,
-    /// Largest allowed value.
+    /// Maximum.
     pub max: String,
 }
 

@@ -1,8 +1,8 @@
-//! Sizes of images.
+//! Shape of images.
 
-/// Width and height of every image, in pixels (section "Experiment design").
+/// Width and height of an image, in pixels (section "Experiment design").
 pub const SIZE: i64 = 84;
 /// Colour channels: red, green, blue.
 pub const CHANNELS: i64 = 3;
-/// Bytes of one image, RGB8, row by row.
+/// Size of an image, RGB8 in row-major order, in bytes.
 pub const BYTES: usize = (SIZE * SIZE * CHANNELS) as usize;

@@ -1,4 +1,4 @@
-//! Training steps behind one interface, whatever computes them.
+//! Interface of training steps, common to all engines.
 
 use crate::archive::Tensors;
 use crate::batch::Batch;
@@ -8,48 +8,49 @@ use std::fmt::Debug;
 
 /// A model in training.
 pub trait Learner: Debug + Send {
-    /// Moves the weights down the outer loss of a batch, by Adam.
+    /// One step of Adam on the outer loss of a batch.
     ///
     /// # Errors
-    /// If the loss is not finite, or the device fails; the weights stay as they were.
+    /// If the loss is not finite, or the device fails; the weights are then unchanged.
     fn step(&mut self, batch: &Batch, learning_rate: f64) -> Result<Step, LearnerError>;
 
     /// The model with its current weights.
     fn model(&self) -> Model;
 
-    /// Weights and the optimiser's moments by name: `weight.`, `mean.` and `square.` before each weight's name.
+    /// Weights and the optimiser's first and second moments, named by the prefixes `weight.`, `mean.` and `square.` and the
+    /// weight's name.
     fn state(&self) -> Tensors;
 
-    /// Restores a [`Learner::state`] of `steps` steps.
+    /// Restores a [`Learner::state`] after `steps` steps.
     ///
     /// # Errors
-    /// Names the tensor that is missing or of another shape.
+    /// The first tensor that is missing, or of another shape or type.
     fn restore(&mut self, state: &Tensors, steps: u32) -> Result<(), LearnerError>;
 }
 
 /// Result of a training step.
 #[derive(Debug, Clone, Copy)]
 pub struct Step {
-    /// The outer loss before the step.
+    /// Outer loss before the step.
     pub loss: f64,
-    /// Norm of its gradient over all weights, before clipping.
+    /// Norm of the gradient over all weights, before clipping.
     pub gradient_norm: f64,
-    /// Time of the step's parts.
+    /// Time of the step's stages.
     pub times: StageTimes,
 }
 
-/// Parts of a training step, in seconds.
+/// Time of a training step's stages, in seconds.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct StageTimes {
-    /// The encoder; forward and backward in the native engine, forward in libtorch's.
+    /// Encoder: forward and backward in the native engine, forward only in libtorch's.
     pub encoder_seconds: f64,
-    /// Plans, the outer loss, and back to the embeddings; in libtorch's engine through the encoder, too.
+    /// Inner loop, outer loss and their backward pass to the embeddings; in libtorch's engine also the encoder's backward pass.
     pub outer_loop_seconds: f64,
-    /// The update of the weights.
+    /// Update of the weights.
     pub optimiser_seconds: f64,
 }
 
-/// A training step that failed, or a state that does not fit.
+/// Error of a training step, or of a state to restore.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnerError {
     /// A loss that is NaN or infinite.
@@ -63,7 +64,7 @@ pub enum LearnerError {
         /// Shape of the weight.
         shape: Vec<usize>,
     },
-    /// An error of the device that computes.
+    /// Error of the device.
     #[error("{0}")]
     Device(String),
 }

@@ -1,11 +1,11 @@
 //! Contextual Planning Networks: the method in pure Rust.
 //!
-//! Visual goal-directed meta-learning with contextual planning networks (Rivera and Handelman, 2021) shows an agent one image of a
-//! finished task and plans towards it in a learned latent space. A [`Model`] is the configuration and the weights of an image
+//! The agent of "Visual goal-directed meta-learning with contextual planning networks" (Rivera and Handelman, 2021) gets one image
+//! of a finished task and plans towards it in a learned latent space. A [`Model`] is the configuration and the weights of an image
 //! encoder f_φ and of g_θ, the combined policy and dynamics network; a [`Checkpoint`](checkpoint::Checkpoint) is a model with its
-//! provenance. An [`Engine`] computes with a model: its plans, as a [`Method`], and its training, as a [`Learner`]. The engine of
-//! this crate, [`engine::Native`], works by hand-derived passes on the processor; the crate `cpn-torch` has the reference by
-//! autograd, and an engine for every device of libtorch.
+//! provenance. An [`Engine`] computes a model's plans, as a [`Method`], and its training, as a [`Learner`]. The engine of this
+//! crate, [`engine::Native`], runs hand-derived forward and backward passes on the processor; the crate `cpn-torch` has the
+//! reference by autograd, and an engine for every device of libtorch.
 //!
 //! | symbol | name here | meaning |
 //! |---|---|---|
@@ -18,7 +18,7 @@
 //! | x_t, x_g | `x`, `x_g` | their embeddings, `[B, Z]` |
 //! | â_{t:t+H} | `Plan::actions` | planned actions, `[B, H, A]` |
 //!
-//! Files are validated once, where bytes become a model ([`checkpoint`]); past that edge a wrong shape is a bug and panics.
+//! Files are validated once, in [`checkpoint::from_bytes`]; a wrong shape after that is a bug and panics.
 
 pub mod archive;
 mod batch;

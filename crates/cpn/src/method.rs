@@ -9,47 +9,47 @@ pub use crate::observation::{Frames, Observed};
 pub use crate::search::ongoing::Ongoing;
 pub use crate::search::{Iterations, Plan, Query, Search, Solver, rollouts};
 
-/// A method of control: from an observation and a goal to actions. Model predictive control applies the first action of each
-/// plan and plans anew.
+/// A control policy: from embeddings of an observation and a goal to a plan of actions. Model predictive control applies the first
+/// action of each plan, and plans again at the next step.
 pub trait Method: Send {
     /// Short name of the method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
     fn name(&self) -> &'static str;
 
-    /// H, the number of actions in a plan.
+    /// H, the planning horizon.
     fn horizon(&self) -> usize;
 
-    /// A, the numbers of an action.
+    /// A, the number of continuous actions.
     fn actions(&self) -> usize;
 
-    /// U, the updates of a plan that it was trained with; none if it does not predict where actions lead, so that there is
-    /// nothing to search.
+    /// U, the number of updates of a plan in training; `None` for a method without predicted states, which no search can
+    /// improve.
     fn updates(&self) -> Option<usize>;
 
     /// True if observations and goals of this kind can be embedded.
     fn takes(&self, input: Input) -> bool;
 
-    /// Embeddings of observations or goals of the kind it takes, `[Z]` each; Z is 0 for a method that does not look. An embedding
-    /// does not depend on what else is embedded.
+    /// Embeddings of observations or goals of a kind that it takes, `[Z]` each; Z is 0 for a method that ignores them. An embedding
+    /// does not depend on the rest of the batch.
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>>;
 
-    /// A plan for each query, all by the same search. A plan does not depend, in any bit, on what else is planned for.
+    /// A plan for each query, all by the same search. A plan is bit for bit independent of the rest of the batch.
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;
 
-    /// Maximum number of queries that [`Method::resume`] takes together, for [`Solver::Gradient`]; for the other solvers it is one.
+    /// Maximum batch size of [`Method::resume`] for [`Solver::Gradient`]; for the other solvers it is one.
     fn together(&self) -> usize {
         1
     }
 
-    /// One or more pieces of a search for queries, always the same, until the search is over or `go_on`, called after each piece,
-    /// returns false. The first piece is the search's beginning, and `go_on` is not called after it. A method without pieces does
-    /// all at once.
+    /// One or more pieces of a search, until it is over or `go_on`, called after each piece, returns false. The queries must be the
+    /// same in every call. The first call computes the first piece alone, without a call of `go_on`. A method that cannot be
+    /// suspended computes the whole search at once.
     fn resume(&mut self, queries: &[Query<'_>], ongoing: &mut Ongoing, _go_on: &mut dyn FnMut() -> bool) {
         let iterations = Iterations::Fixed(ongoing.iterations);
         ongoing.state = State::Whole(self.plan(queries, &mut Search { solver: ongoing.solver, iterations }));
     }
 }
 
-/// The control of every comparison: uniform actions in [-1, 1], independent of the images.
+/// Random baseline of the comparison: uniform actions in [-1, 1], independent of the images.
 #[derive(Debug)]
 pub struct Random {
     /// A, the number of continuous actions.

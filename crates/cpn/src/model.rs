@@ -1,4 +1,4 @@
-//! A model: its configuration and its weights.
+//! Models: configuration and weights.
 
 use crate::archive::{Tensor, Tensors};
 use crate::config::{EncoderConfig, ImageEncoderConfig, ModelConfig, PositionEncoderConfig};
@@ -6,11 +6,11 @@ use crate::{images, positions};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Initial bias of the attenuation networks' outputs: attenuation starts near 1 (sigmoid(2) = 0.88), so that training starts from
-/// an almost plain linear layer.
+/// Initial bias of the attenuation networks' outputs: sigmoid(2) = 0.88, so that a layer is almost linear at the start of
+/// training.
 const GATE_BIAS: f32 = 2.0;
 
-/// Encoder, g_θ and the step size of the inner loop, as numbers.
+/// A model: configuration and weights of the encoder f_φ, of g_θ and of the inner loop's step size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     /// Sizes and method.
@@ -33,14 +33,14 @@ pub struct Parameter {
 /// Distribution of a weight's initial values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Init {
-    /// One value.
+    /// A constant.
     Constant(f32),
-    /// Uniform in ± this.
+    /// Uniform between minus and plus a bound.
     Uniform(f32),
 }
 
 impl Model {
-    /// A freshly initialised model of a valid configuration, the same for the same seed on every machine.
+    /// A newly initialised model of a valid configuration. Equal seeds give equal weights, on every machine.
     pub fn new(config: ModelConfig, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut draw = |init| match init {
@@ -74,7 +74,7 @@ impl Parameters {
         self.0.push(Parameter { name: name.to_owned(), shape, init });
     }
 
-    /// A weight before a rectified linear unit, by He et al. (2015): uniform, of variance 2 / fan-in.
+    /// The weight of a layer before a rectified linear unit, initialised as by He et al. (2015): uniform, of variance 2 / fan-in.
     fn weight(&mut self, name: &str, shape: &[i64]) {
         let fan_in: i64 = shape[1..].iter().product();
         self.push(&format!("{name}.weight"), shape, Init::Uniform((6.0 / fan_in as f32).sqrt()));

@@ -11,7 +11,7 @@ pub enum Observed<'a> {
     Position([f32; 3]),
 }
 
-/// Several observations or goals of one kind.
+/// F observations or goals of one kind.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Frames {
     /// RGB8, `[F, 84, 84, 3]`.
@@ -21,7 +21,7 @@ pub enum Frames {
 }
 
 impl Frames {
-    /// The frames one by one, without the bytes after the last whole image.
+    /// The frames; bytes after the last complete image are ignored.
     pub fn observed(&self) -> Vec<Observed<'_>> {
         match self {
             Self::Images(bytes) => bytes.chunks_exact(images::BYTES).map(Observed::Image).collect(),

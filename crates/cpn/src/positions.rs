@@ -1,4 +1,4 @@
-//! Sizes of positions.
+//! Shape of positions.
 
-/// Values of a position: x, y, z, in metres.
+/// Number of coordinates of a position: x, y, z, in metres.
 pub const SIZE: i64 = 3;

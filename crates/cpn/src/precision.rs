@@ -1,4 +1,4 @@
-//! Precision of the image encoder's products.
+//! Arithmetic precision of the image encoder.
 
 use crate::engine::simd::bf16::Bf16x2;
 use serde::{Deserialize, Serialize};
@@ -7,15 +7,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
-    /// Numbers as they are.
+    /// Float32.
     Float32,
-    /// Numbers rounded to 8 bits, whose products are added up in float32: close, and faster where the processor has instructions
-    /// for it (AVX512-BF16). Elsewhere slower.
+    /// Factors rounded to bfloat16, with 8 bits of mantissa, and products accumulated in float32: faster on processors with
+    /// AVX512-BF16, and slower elsewhere.
     Bfloat16,
 }
 
 impl Precision {
-    /// The same, or float32 where the processor has no instructions for bfloat16.
+    /// This precision; float32 instead of bfloat16 on processors without instructions for it.
     pub fn where_faster(self) -> Self {
         if Bf16x2::is_fast() { self } else { Self::Float32 }
     }

@@ -1,87 +1,87 @@
-//! What a model is trained by, and the named choices of it.
+//! Recipes: model configurations with training settings, and the named presets.
 
 use crate::config::{ConfigError, EncoderConfig, Input, MethodKind, ModelConfig, in_range};
 use crate::precision::Precision;
 use serde::{Deserialize, Serialize};
 
-/// Which later frame of a demonstration a sample is to reach.
+/// Choice of a sample's goal among the later frames of its demonstration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GoalSampling {
-    /// The last, as in the paper (section "Experiment design").
+    /// The last frame, as in the paper (section "Experiment design").
     Final,
-    /// Any that the plan can reach, one to horizon × action block steps later; as Universal Planning Networks are trained.
+    /// A random frame within the plan's reach, one to horizon × action block steps later, as in Universal Planning Networks.
     WithinHorizon,
-    /// Any later one (hindsight experience replay's `future`).
+    /// A random later frame (hindsight experience replay's `future`).
     Hindsight,
 }
 
-/// How the outer loop is run. With the model's configuration and the seed it decides the weights that some data lead to.
+/// Training settings of the outer loop. With the model's configuration, the data and the seed they determine the weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Training {
-    /// Passes over every frame that has an action.
+    /// Passes over all frames with an action.
     pub epochs: u32,
-    /// Samples of a step.
+    /// Batch size, in samples.
     pub batch_size: usize,
-    /// Samples that a batch takes from a demonstration at a time; 1 shuffles them one by one. Those of one demonstration
+    /// Number of samples drawn from a demonstration at a time; 1 shuffles single samples. Samples of one demonstration in a batch
     /// share their final goal, which is then encoded once.
     pub samples_per_draw: usize,
-    /// Which goals they are to reach.
+    /// Choice of the samples' goals.
     pub goals: GoalSampling,
-    /// Steps that each planned action is held for; it is trained to be the mean of the demonstrated ones.
+    /// Number of steps that a planned action is held for (action repeat); its target is the mean of the demonstrated actions.
     pub action_block: usize,
-    /// Largest shift of the images, in pixels, the same for all of a demonstration in a batch; 0 for none.
+    /// Maximum random shift of images, in pixels; one shift for all images of a demonstration in a batch; 0 for none.
     pub shift_pixels: u32,
-    /// Largest change of brightness and contrast, as a share; likewise; 0 for none.
+    /// Maximum relative change of brightness and contrast; one change for all images of a demonstration in a batch; 0 for none.
     pub colour_jitter: f64,
-    /// Highest learning rate of the one-cycle schedule of Adam.
+    /// Peak learning rate of Adam's one-cycle schedule.
     pub peak_learning_rate: f64,
-    /// Longest gradient, as a norm over all weights.
+    /// Maximum norm of the gradient over all weights; longer gradients are clipped.
     pub max_gradient_norm: f64,
-    /// What the encoder computes in.
+    /// Arithmetic precision of the encoder.
     pub precision: Precision,
 }
 
-/// A model and its training: all that decides the weights but the data and the seed.
+/// Configuration of a model and of its training. With the data and the seed it determines the weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// What is trained.
+    /// Model configuration.
     pub model: ModelConfig,
-    /// How.
+    /// Training settings.
     pub training: Training,
 }
 
-/// A recipe by name.
+/// Name of a predefined recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Preset {
-    /// Behaviour cloning, as the paper has it.
+    /// Behaviour cloning, as in the paper.
     PaperBc,
-    /// Behaviour cloning with task embedding, as the paper has it.
+    /// Behaviour cloning with task embedding, as in the paper.
     PaperTeBc,
-    /// The universal planning network, as the paper has it.
+    /// Universal planning network, as in the paper.
     PaperUpn,
-    /// The contextual planning network, as the paper has it.
+    /// Contextual planning network, as in the paper.
     PaperCpn,
-    /// The contextual planning network as we train it: in a tenth of the passes, and fast.
+    /// Contextual planning network with our faster training: a tenth of the epochs, shared goals, and bfloat16.
     Cpn,
-    /// The contextual planning network of positions in the Jenga scene (section "JENGA domain on a physical robot").
+    /// Contextual planning network of positions in the Jenga scene (section "JENGA domain on a physical robot").
     Jenga,
 }
 
-/// Where the hand and its goals are in the Jenga scene: the mean, in whole millimetres, of 21 demonstrations of `jenga-poke`
-/// with the seeds 0 to 20, computed once.
+/// Mean position of the hand and its goals in the Jenga scene, in millimetres: of 21 demonstrations of `jenga-poke` with the seeds
+/// 0 to 20.
 const JENGA_CENTRE_MM: [i64; 3] = [631, 2, 187];
-/// How far from there they are: the standard deviation, over all three axes.
+/// Standard deviation of these positions over all three axes, in millimetres.
 const JENGA_SCALE_MM: i64 = 62;
 
 impl Preset {
-    /// All, in the order that they are listed in.
+    /// All presets, in the order of lists.
     pub const ALL: [Self; 6] = [Self::PaperBc, Self::PaperTeBc, Self::PaperUpn, Self::PaperCpn, Self::Cpn, Self::Jenga];
 
-    /// The name, as it is typed.
+    /// Name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::PaperBc => "paper-bc",
@@ -93,7 +93,7 @@ impl Preset {
         }
     }
 
-    /// What the name stands for.
+    /// The recipe of this name.
     pub fn recipe(self) -> Recipe {
         let paper = |method| Recipe { model: ModelConfig::paper(method), training: Training::paper() };
         match self {
@@ -125,7 +125,7 @@ impl Preset {
 }
 
 impl Training {
-    /// The paper's 50 epochs towards final goals; the rest it leaves open.
+    /// The paper's 50 epochs and final goals, and our choice of the settings that it leaves open.
     pub fn paper() -> Self {
         Self {
             epochs: 50,
@@ -144,7 +144,7 @@ impl Training {
     /// Checks every value against its range.
     ///
     /// # Errors
-    /// Names the first field out of its range, what was expected and what came.
+    /// The first field out of its range, with the range and the value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let count = |field, value: usize, max| in_range(field, i64::try_from(value).unwrap_or(i64::MAX), 1, max);
         count("training.epochs", self.epochs as usize, 100_000)?;
@@ -166,10 +166,10 @@ impl Training {
 }
 
 impl Recipe {
-    /// Checks every value against its range. Only images can be changed at random.
+    /// Checks every value against its range. Augmentation is allowed only with images.
     ///
     /// # Errors
-    /// Names the first field out of its range, what was expected and what came.
+    /// The first field out of its range, with the range and the value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.model.validate()?;
         if self.model.encoder.input() == Input::Position {

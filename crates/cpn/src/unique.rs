@@ -1,10 +1,11 @@
-//! JSON in which every key stands once. Serde's own maps let the last one win, so that two readers of a file may see two things.
+//! Detection of duplicate JSON keys: serde's maps keep the last duplicate and other readers the first, so that two readers of a
+//! file could see different values.
 
 use serde::de::{Deserialize, Deserializer, Error, MapAccess, SeqAccess, Visitor};
 use std::collections::HashSet;
 use std::fmt;
 
-/// Any JSON, as long as no object in it has a key twice.
+/// Any JSON value without duplicate keys.
 struct Unique;
 
 impl<'de> Deserialize<'de> for Unique {
@@ -63,10 +64,10 @@ impl<'de> Visitor<'de> for UniqueVisitor {
     }
 }
 
-/// Checks that bytes are one JSON value in which no key stands twice.
+/// Checks that bytes are one JSON value without duplicate keys.
 ///
 /// # Errors
-/// If they are not.
+/// If the JSON is malformed, or an object has a duplicate key.
 pub(crate) fn check(json: &[u8]) -> Result<(), serde_json::Error> {
     serde_json::from_slice::<Unique>(json).map(drop)
 }

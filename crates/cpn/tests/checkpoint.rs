@@ -1,4 +1,4 @@
-//! Checkpoints come back as they were, and damaged ones are refused with the reason.
+//! Checkpoints: round trips, and refusals of damaged files, with the reason.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -23,7 +23,7 @@ fn saved() -> Vec<u8> {
     checkpoint::to_bytes(&Model::new(small_config(MethodKind::Cpn), 5), &provenance()).unwrap()
 }
 
-/// The message of the refusal of a checkpoint that `spoil` has made wrong.
+/// Message of the refusal of a checkpoint after `spoil`.
 fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
     let (mut tensors, mut metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
     spoil(&mut tensors, &mut metadata);
@@ -31,7 +31,7 @@ fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
 }
 
 #[test]
-fn a_checkpoint_comes_back_whole() {
+fn a_checkpoint_round_trips() {
     for config in MethodKind::ALL.into_iter().flat_map(|method| [small_config(method), position_config(method)]) {
         let model = Model::new(config, 5);
         let bytes = checkpoint::to_bytes(&model, &provenance()).unwrap();
@@ -86,7 +86,7 @@ fn an_oversized_header_is_refused_unparsed() {
     );
 }
 
-/// A checkpoint whose header `spoil` has made another one, of text.
+/// A checkpoint with the text of its header replaced by `spoil`.
 fn with_header(spoil: impl FnOnce(String) -> String) -> String {
     let bytes = saved();
     let length = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
@@ -96,9 +96,9 @@ fn with_header(spoil: impl FnOnce(String) -> String) -> String {
     checkpoint::from_bytes(&file).map_or_else(|error| error.to_string(), |_| "accepted".to_owned())
 }
 
-/// What stands twice is refused, wherever it does: two readers might see two different things.
+/// Readers differ in which of two duplicates they use, so that duplicates are refused everywhere.
 #[test]
-fn what_stands_twice_is_refused() {
+fn duplicate_keys_are_refused() {
     assert_eq!(with_header(|header| header), "accepted");
     let tensor = |header: &str| {
         let start = header.find("\"step_size\":").unwrap();
@@ -123,7 +123,7 @@ fn what_stands_twice_is_refused() {
 }
 
 #[test]
-fn a_render_spec_is_json_or_nothing() {
+fn a_render_spec_is_json_or_empty() {
     let spec = |text: &str| refusal(|_, metadata| metadata["provenance"]["render_spec"] = text.into());
     for text in ["blender", "{\"camera\":", "{} {}", "{\"a\":1,\"a\":2}"] {
         let message = spec(text);
@@ -131,7 +131,7 @@ fn a_render_spec_is_json_or_nothing() {
     }
 }
 
-/// What a file that was named by mistake, or with intent, begins with is nobody's business.
+/// A file may be named by mistake or with intent, and its contents must not leak into an error.
 #[test]
 fn a_refusal_shows_no_bytes_of_a_file() {
     let secret = b"-----BEGIN PRIVATE KEY-----\nMIGHAgEAMBMGByqGSM49AgEGCCqGSM49AwEHBG0wawIBAQQg";
@@ -149,7 +149,7 @@ fn a_refusal_shows_no_bytes_of_a_file() {
 #[test]
 fn another_format_is_refused() {
     assert_eq!(refusal(|_, m| m["format"] = json!(1)), "checkpoint format: expected 3, got 1");
-    // An older one lacks fields: that it is older is what counts.
+    // An older format lacks fields, and the error names the format all the same.
     assert_eq!(refusal(|_, m| *m = json!({"format": 1})), "checkpoint format: expected 3, got 1");
     assert_eq!(refusal(|_, m| *m = json!({})), "checkpoint format: expected 3, got no number");
 }
@@ -179,13 +179,13 @@ fn a_wrong_type_is_named() {
 }
 
 #[test]
-fn a_weight_that_is_not_a_number_is_named() {
+fn a_weight_of_nan_is_named() {
     let message = refusal(|tensors, _| drop(tensors.insert("step_size".into(), Tensor::new(&[], &[f32::NAN]))));
     assert_eq!(message, "checkpoint tensor \"step_size\": expected finite values, got NaN or infinity");
 }
 
 #[test]
-fn a_configuration_out_of_range_builds_nothing() {
+fn a_configuration_out_of_range_is_refused() {
     let message = refusal(|_, metadata| metadata["model"]["encoder"]["latent"] = json!(1_000_000_000));
     assert_eq!(message, "checkpoint model: encoder.latent: expected 1 to 512, got 1000000000");
     let message = refusal(|_, metadata| metadata["model"]["encoder"]["convolutions"][0]["kernel"] = json!(0));
@@ -209,7 +209,7 @@ fn a_configuration_out_of_range_builds_nothing() {
     assert!(message.starts_with("checkpoint metadata: "), "{message}");
 }
 
-/// Names and shapes in the tables of `docs/checkpoint-format.md`, as the page says they are in the shipped model.
+/// Names and shapes of a shipped model's tensors in the tables of `docs/checkpoint-format.md`.
 fn documented() -> BTreeMap<String, String> {
     let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/checkpoint-format.md");
     let page = std::fs::read_to_string(page).unwrap();
@@ -231,7 +231,7 @@ fn the_page_lists_every_tensor_of_a_shipped_model() {
     for (name, shape) in &documented {
         assert_eq!(shipped.remove(name).as_ref(), Some(shape), "{name}");
     }
-    // The attenuation networks of the trunk stand for those of the other layers.
+    // The page lists the attenuation networks of the trunk, as an example of all layers.
     let trunk: Vec<_> = documented.keys().filter_map(|name| name.strip_prefix("network.trunk.")).collect();
     for layer in ["policy_0", "policy_1", "dynamics_0", "dynamics_1"] {
         for part in trunk.iter().filter(|part| part.starts_with("u.") || part.starts_with("v.")) {

@@ -1,7 +1,7 @@
-//! Our side of `make bench-plan`: writes the model and the images that everybody plans with, and plans when asked to.
+//! CPN's contender of `make bench-plan`: writes the model and the images shared by all contenders, and plans on request.
 //!
-//! Numbers of batches come in on stdin, one a line; what they took goes out as a line of JSON. `stages` asks where the time of
-//! a batch went, on average over all so far; `plans` asks for those of the first batch.
+//! Requests are lines on standard input, answers lines of JSON on standard output. A number plans so many batches, and gives their
+//! time; `stages` gives the mean time of a batch's stages so far; `plans` gives the plans of the first batch.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
@@ -15,20 +15,21 @@ use std::io::{self, BufRead};
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// Distinct observations, over and over.
+/// Number of distinct observations, which are used cyclically.
 const FRAMES: usize = 64;
 const SEED: u64 = 0;
+/// Factor on the weights of the predicted change of state.
 const DAMPING: f32 = 0.1;
 
 #[derive(Parser)]
 struct Args {
-    /// Plan with this model.
+    /// Model to plan with.
     #[arg(long, required_unless_present = "write_model")]
     model: Option<PathBuf>,
-    /// Write a model, and images beside its weights.
+    /// File to write a model and images to.
     #[arg(long)]
     write_model: Option<PathBuf>,
-    /// Of this checkpoint, instead of a new one.
+    /// Checkpoint of the written model; default: an untrained model.
     #[arg(long)]
     checkpoint: Option<PathBuf>,
     #[arg(long, default_value = "cpn")]
@@ -41,18 +42,18 @@ struct Args {
     updates: Option<i64>,
     #[arg(long, default_value_t = 1)]
     batch: usize,
-    /// Engine that plans.
+    /// Engine.
     #[arg(long, value_enum, default_value = "native")]
     engine: EngineKind,
-    /// Device that plans.
+    /// Device.
     #[arg(long, default_value_t)]
     device: Device,
     #[arg(long, default_value_t = 1)]
     threads: usize,
-    /// Encode in bfloat16, where the processor has instructions for it.
+    /// Encode images in bfloat16, on processors with instructions for it.
     #[arg(long)]
     bfloat16: bool,
-    /// What `cargo bench` says.
+    /// Flag passed by `cargo bench`, ignored.
     #[arg(long, hide = true)]
     bench: bool,
 }
@@ -75,18 +76,20 @@ fn write(path: &PathBuf, args: &Args) {
         encoder.latent = args.latent.unwrap_or(encoder.latent);
     }
     config.validate().unwrap();
+
     let mut model = match &args.checkpoint {
         Some(path) => checkpoint::from_bytes(&std::fs::read(path).unwrap()).unwrap().model,
         None => Model::new(config, SEED),
     };
     if args.checkpoint.is_none() {
-        // The steps that an untrained model predicts are so large that a plan longer than the paper's would be chaos, in which
-        // no two programs agree.
+        // An untrained model predicts such large changes of state that plans longer than the paper's are chaotic: rounding errors
+        // would make the contenders differ.
         for (_, weight) in model.weights.iter_mut().filter(|(name, _)| name.starts_with("network.dynamics_1.")) {
             let damped: Vec<f32> = weight.elements::<f32>().unwrap().iter().map(|value| value * DAMPING).collect();
             *weight = Tensor::new(weight.shape(), &damped);
         }
     }
+
     let size = images::SIZE as usize;
     let noise = |seed| Tensor::new(&[FRAMES, size, size, 3], &testing::noise_images(FRAMES, seed));
     let mut tensors = Tensors::from([("frames".to_owned(), noise(1)), ("goals".to_owned(), noise(2))]);
@@ -101,17 +104,19 @@ fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: 
     let weights = tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t)));
     let model = Model { config, weights: weights.collect() };
     let precision = if bfloat16 { Precision::Bfloat16.where_faster() } else { Precision::Float32 };
+
     let engine = engines::build(Some(engine), device, threads).unwrap();
     let mut planner = engine.planner(&model, precision).unwrap();
     let observed = |bytes| -> Vec<_> { <[u8]>::chunks_exact(bytes, images::BYTES).map(Observed::Image).collect() };
     let (frames, x_gs) = (observed(&frames), planner.encode(&observed(&goals)));
+
     let (mut encoding, mut planning, mut batches) = (0.0, 0.0, 0);
     let mut run = |index: usize| {
-        let places: Vec<_> = (0..batch).map(|row| (index * batch + row) % FRAMES).collect();
+        let indices: Vec<_> = (0..batch).map(|row| (index * batch + row) % FRAMES).collect();
         let started = Instant::now();
-        let xs = planner.encode(&places.iter().map(|place| frames[*place]).collect::<Vec<_>>());
+        let xs = planner.encode(&indices.iter().map(|index| frames[*index]).collect::<Vec<_>>());
         let encoded = Instant::now();
-        let ends = xs.iter().zip(places.iter().map(|place| &x_gs[*place]));
+        let ends = xs.iter().zip(indices.iter().map(|index| &x_gs[*index]));
         let queries: Vec<_> = ends.map(|(x, x_g)| Query { x, x_g, seed: 0, start: &[] }).collect();
         let iterations = Iterations::Fixed(model.config.updates as usize);
         let plans = planner.plan(&queries, &mut Search { solver: Solver::Gradient, iterations });
@@ -120,6 +125,7 @@ fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: 
         batches += 1;
         (plans, json!({"encoder": encoding / f64::from(batches), "planner": planning / f64::from(batches)}))
     };
+
     let plans = run(0).0;
     println!("{}", json!({"ready": true, "actions": plans[0].actions}));
     for line in io::stdin().lock().lines() {

@@ -1,4 +1,4 @@
-//! Choice of the engine that computes plans and training: the native one, or libtorch's where it is compiled in (feature `torch`).
+//! Choice of an engine by name and device: the native engine, or libtorch's if compiled in (feature `torch`).
 
 use cpn::Engine;
 use cpn::engine::{EngineError, Native};
@@ -24,15 +24,15 @@ pub enum Device {
     /// The processor.
     #[default]
     Cpu,
-    /// The CUDA device of this index.
+    /// A CUDA device, by its index.
     Cuda(usize),
 }
 
-/// The engine of a name on a device, or the device's own: native on the CPU, torch on a CUDA device. On the CPU it computes on
-/// `threads` threads, at least one.
+/// The engine of a name on a device; by default native on the CPU, and torch on a CUDA device. On the CPU it uses `threads`
+/// threads, at least one.
 ///
 /// # Errors
-/// If the engine does not compute on the device or is not compiled in, or there is no such device; names the option.
+/// If the engine does not support the device or is not compiled in, or the device does not exist; the error names the option.
 pub fn build(engine: Option<EngineKind>, device: Device, threads: usize) -> Result<Arc<dyn Engine>, EngineError> {
     let default = if device == Device::Cpu { EngineKind::Native } else { EngineKind::Torch };
     match (engine.unwrap_or(default), device) {
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn devices_are_read_as_they_are_written() {
+    fn devices_round_trip_through_text() {
         for text in ["cpu", "cuda:0", "cuda:12"] {
             assert_eq!(text.parse::<Device>().expect(text).to_string(), text);
         }
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn an_engine_that_cannot_be_had_names_its_option() {
+    fn an_unavailable_engine_or_device_is_named() {
         let error = |engine, device| build(engine, device, 1).map(drop).unwrap_err().to_string();
         let native = error(Some(EngineKind::Native), Device::Cuda(0));
         assert_eq!(native, "device: expected cpu for the engine native, got cuda:0");

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A model of images with few weights.
+/// Configuration of a small model of images.
 pub fn small_config(method: MethodKind) -> ModelConfig {
     let encoder = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![
@@ -19,30 +19,31 @@ pub fn small_config(method: MethodKind) -> ModelConfig {
     ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) }
 }
 
-/// The same model for positions in a box of 2 m.
+/// Configuration of a small model of positions, for a box of about 2 m.
 pub fn position_config(method: MethodKind) -> ModelConfig {
     let (centre_mm, scale_mm, layers) = ([500, 0, -200], 400, vec![7, 5]);
     let encoder = PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 6, layer_norm: true };
     ModelConfig { encoder: EncoderConfig::Position(encoder), actions: 3, ..small_config(method) }
 }
 
-/// Bytes of `count` images of noise, RGB8.
+/// Bytes of `count` random images, RGB8.
 pub fn noise_images(count: usize, seed: u64) -> Vec<u8> {
     let mut bytes = vec![0; count * images::BYTES];
     ChaCha8Rng::seed_from_u64(seed).fill(bytes.as_mut_slice());
     bytes
 }
 
-/// `count` values in [-1, 1).
+/// `count` random values in [-1, 1).
 pub fn uniform(count: usize, seed: u64) -> Vec<f64> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
 }
 
-/// Maximum number of features of [`encoders`]; over more, float32's linear layer alone rounds by more than 1e-5.
+/// Maximum number of features of [`encoders`]: with more, rounding in the linear layer exceeds 1e-5 in float32.
 const FEATURES: i64 = 8192;
 
-/// Encoders of one or two convolutions: kernels of one to four strides, or of a pixel more; images that end with a tile, or not.
+/// Random encoders of one or two convolutions: kernels of one to four strides, or a pixel more, so that images end with a tile or
+/// within one.
 pub fn encoders() -> impl Strategy<Value = ImageEncoderConfig> {
     let taps = (1i64..5, 1i64..5, 0i64..2).prop_map(|(taps, stride, more)| (taps * stride + more, stride));
     let convolution = (prop_oneof![Just(16i64), Just(32), Just(5)], taps)

@@ -1,4 +1,4 @@
-//! Checkpoints: no bytes make the reader panic or take much memory, and what it reads is written as it was read.
+//! Checkpoints: no input makes the reader panic or allocate too much, and checkpoints that are read round-trip.
 
 #![no_main]
 
@@ -14,8 +14,8 @@ fuzz_target!(init: { fuzz::seed("checkpoint", inputs(), check) }, |input: &[u8]|
     let _ = check(input);
 });
 
-/// The first byte says whether a file follows or only the document of one, to stand beside the weights of an example:
-/// in a file, a document that is longer or shorter by a byte leaves nothing where it should be.
+/// Checks an input: after a first byte of 0 a file, else the document for the weights of an example. In a mutated file, a document
+/// of another length would shift all offsets.
 fn check(input: &[u8]) -> Result<(), CheckpointError> {
     match input {
         [] => Ok(()),
@@ -42,7 +42,7 @@ fn check_file(file: &[u8]) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-/// Small checkpoints, of every kind of encoder.
+/// Small checkpoints with each kind of encoder.
 static EXAMPLES: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
     let image = EncoderConfig::Image(ImageEncoderConfig {
         convolutions: vec![ConvConfig { channels: 1, kernel: 8, stride: 16 }],

@@ -1,4 +1,4 @@
-//! Requests of openpi's clients: no bytes make the decoder panic, and an error stays short.
+//! Requests of openpi's clients: no input makes the decoder panic, and errors are short.
 
 #![no_main]
 
@@ -7,7 +7,7 @@ use rmpv::Value;
 use wire::Error;
 use wire::planner::ListModelsResponse;
 
-/// Longest error, in bytes; it quotes the request.
+/// Maximum length of an error, in bytes; it quotes the request.
 const MAX_ERROR_BYTES: usize = 1200;
 
 fuzz_target!(init: fuzz::seed("openpi", requests(), check), |input: &[u8]| {

@@ -1,4 +1,4 @@
-//! Recordings: no bytes make the reader panic, and what it reads is written and read as the same again.
+//! Recordings: no input makes the reader panic, and recordings that are read round-trip.
 
 #![no_main]
 
@@ -20,12 +20,12 @@ fuzz_target!(init: fuzz::seed("recording", recordings(), check), |input: &[u8]| 
 });
 
 fn check(input: &[u8]) -> Result<(), ReadError> {
-    let demonstration = survives(input, recording::from_bytes, recording::to_bytes);
-    demonstration.or_else(|_| survives(input, plans::from_bytes, plans::to_bytes))
+    let demonstration = round_trip(input, recording::from_bytes, recording::to_bytes);
+    demonstration.or_else(|_| round_trip(input, plans::from_bytes, plans::to_bytes))
 }
 
-/// Compares bytes, since some plans may hold what is not a number.
-fn survives<T>(
+/// Checks a round trip. Bytes are compared, since plans may contain NaN.
+fn round_trip<T>(
     input: &[u8],
     read: fn(&[u8]) -> Result<T, ReadError>,
     write: fn(&T) -> Result<Vec<u8>, McapError>,
@@ -36,7 +36,7 @@ fn survives<T>(
     Ok(())
 }
 
-/// Recordings as they are written, and copies, whose parts can be changed without spoiling a checksum.
+/// Recordings as written, and copies without checksums, which allow mutations.
 fn recordings() -> Vec<Vec<u8>> {
     let demonstration = recording::to_bytes(&demonstration()).expect("an episode can be written");
     let plans = plans::to_bytes(&plans()).expect("plans can be written");
@@ -65,7 +65,7 @@ fn copy(recording: &[u8], options: WriteOptions) -> Vec<u8> {
     for message in MessageStream::new(recording).expect("a recording") {
         let Message { channel, sequence, log_time, publish_time, data } = message.expect("a message");
         let schema = channel.schema.as_ref().expect("a schema");
-        // What the schema says is not read here, and would be most of the file.
+        // Without the schema's text, which the reader ignores and which would be most of the file.
         let schema = writer.add_schema(&schema.name, &schema.encoding, &[]).expect("a schema");
         let encoding = &channel.message_encoding;
         let channel_id = writer.add_channel(schema, &channel.topic, encoding, &channel.metadata).expect("a channel");

@@ -1,5 +1,5 @@
-//! Signatures of checkpoints: no bundle, statement or key makes the verifier panic, an error stays short, and what no trusted
-//! key signed is refused.
+//! Signatures of checkpoints: no bundle, statement or key makes the verifier panic, errors are short, and only signatures by
+//! trusted keys are accepted.
 
 #![no_main]
 
@@ -12,7 +12,7 @@ use p256::pkcs8::{EncodePublicKey as _, LineEnding};
 use signing::{Bundle, Error, TrustedKeys, digest};
 use std::sync::LazyLock;
 
-/// Longest error, in bytes; it quotes the bundle.
+/// Maximum length of an error, in bytes; it quotes the bundle.
 const MAX_ERROR_BYTES: usize = 500;
 const CHECKPOINT: &[u8] = b"weights";
 const FILE: &str = "cpn.safetensors";
@@ -28,7 +28,7 @@ fuzz_target!(init: fuzz::seed("signature", inputs(), check), |input: &[u8]| {
     }
 });
 
-/// The first byte says whether keys follow, a statement to be signed, or a bundle.
+/// Checks an input: by its first byte keys, a statement to be signed, or a bundle.
 fn check(input: &[u8]) -> Result<(), String> {
     let text = |error: Error| error.to_string();
     match input {
@@ -42,7 +42,7 @@ fn check(input: &[u8]) -> Result<(), String> {
         [_, bundle @ ..] => {
             let verified = TRUSTED.verify(Some(bundle), FILE, CHECKPOINT).map(drop).map_err(text);
             if verified.is_ok() {
-                // ECDSA has a second signature for each; the statement is the one that was signed.
+                // A second valid ECDSA signature exists for each, but the statement must be the signed one.
                 let claimed = Bundle::parse(bundle).and_then(|bundle| bundle.claimed_digest());
                 assert_eq!(claimed.as_ref(), Ok(&digest(CHECKPOINT)));
             }
@@ -71,7 +71,7 @@ fn statement() -> String {
     )
 }
 
-/// A bundle around a payload, by the trusted key.
+/// A bundle of a payload signed by the trusted key.
 fn signed(payload: &[u8]) -> Vec<u8> {
     let head = format!("DSSEv1 28 application/vnd.in-toto+json {} ", payload.len());
     let signature: Signature = SIGNER.sign(&[head.as_bytes(), payload].concat());

@@ -1,7 +1,7 @@
-//! Our side of `make bench-train`: writes the batches that everybody trains on, and trains on them when asked to.
+//! CPN's contender of `make bench-train`: writes the batches shared by all contenders, and trains on them on request.
 //!
-//! Numbers of steps come in on stdin, one a line; what they took goes out as a line of JSON. `stages` asks where the time
-//! of a step went, on average over all so far.
+//! Requests are lines on standard input, answers lines of JSON on standard output. A number trains so many steps, and gives their
+//! time; `stages` gives the mean time of a step's stages so far.
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
@@ -22,28 +22,29 @@ use std::time::Instant;
 use trainer::training::dataset::Dataset;
 use trainer::training::sampler::Sampler;
 
-/// Distinct batches, over and over.
+/// Number of distinct batches, which are used cyclically.
 const BATCHES: usize = 8;
-/// Demonstrations of noise, and their lengths: those of Meta-World's experts have 35 to 110 steps.
+/// Number of demonstrations, with random frames.
 const EPISODES: u64 = 32;
+/// Number of steps of a demonstration; those of Meta-World's experts have 35 to 110.
 const STEPS: u32 = 65;
 const LEARNING_RATE: f64 = 1e-3;
 const SEED: u64 = 0;
 
 #[derive(Parser)]
 struct Args {
-    /// Train on these batches.
+    /// File of batches to train on.
     #[arg(long, required_unless_present = "write_batches")]
     batches: Option<PathBuf>,
-    /// Write batches, and the recordings they come from beside them.
+    /// File to write batches to, with their recordings beside it.
     #[arg(long)]
     write_batches: Option<PathBuf>,
     #[arg(long)]
     method: String,
-    /// Engine that trains.
+    /// Engine.
     #[arg(long, value_enum, default_value = "native")]
     engine: EngineKind,
-    /// Device that trains.
+    /// Device.
     #[arg(long, default_value_t)]
     device: Device,
     #[arg(long, default_value_t = 1)]
@@ -56,7 +57,7 @@ struct Args {
     updates: Option<i64>,
     #[arg(long)]
     batch: Option<usize>,
-    /// What `cargo bench` says.
+    /// Flag passed by `cargo bench`, ignored.
     #[arg(long, hide = true)]
     bench: bool,
 }
@@ -70,7 +71,7 @@ fn main() {
     }
 }
 
-/// The recipe of our own CPN for any method and size.
+/// The recipe of the preset `cpn`, with another method and other sizes.
 fn recipe(args: &Args) -> Recipe {
     let method = MethodKind::ALL.into_iter().find(|method| method.name() == args.method).expect("a learned method");
     let Recipe { mut training, .. } = Preset::Cpn.recipe();
@@ -97,6 +98,7 @@ fn write(path: &Path, args: &Args) {
         common::keep(&folder, &common::episode("noise", seed, STEPS));
     }
     let dataset = Dataset::load(&folder, &[], Input::Image).unwrap();
+
     let sampler = Sampler::new(&dataset, &recipe, SEED);
     let Frames::Images(pixels) = dataset.frames() else { panic!("expected images") };
     let samples: Vec<_> =
@@ -112,6 +114,7 @@ fn write(path: &Path, args: &Args) {
         let shape = [&[BATCHES, recipe.training.batch_size, horizon], shape].concat();
         Tensor::new(&shape, &made.iter().flat_map(part).copied().collect::<Vec<f32>>())
     };
+
     let size = images::SIZE as usize;
     let mut tensors = Tensors::from([
         ("frames".to_owned(), Tensor::new(&[pixels.len() / images::BYTES, size, size, 3], pixels)),
@@ -146,12 +149,13 @@ fn train(path: &Path, args: &Args) {
     let sampler = Sampler::new(&dataset, &recipe, SEED);
     thread::scope(|scope| {
         let (sender, batches) = mpsc::sync_channel(1);
-        // As in a run: batches are made while the last one is computed with.
+        // As in a run, the next batch is prepared during a step.
         scope.spawn(move || {
             let over_and_over = std::iter::repeat_with(|| sampler.batches(0).take(BATCHES)).flatten();
             let _ = { over_and_over }.try_for_each(|batch| sender.send(batch));
         });
-        // The loss before any update, in the others' precision; then everything is made warm.
+
+        // The first loss in float32, for comparison with the other contenders; then the warm-up.
         let first = batches.recv().unwrap();
         let loss = learner(Precision::Float32).step(&first, LEARNING_RATE).unwrap().loss;
         let mut learner = learner(recipe.training.precision);
@@ -159,6 +163,7 @@ fn train(path: &Path, args: &Args) {
             learner.step(&batch, LEARNING_RATE).unwrap();
         }
         println!("{}", json!({"ready": true, "loss": loss}));
+
         let (mut stages, mut steps) = (StageTimes::default(), 0);
         for line in io::stdin().lock().lines() {
             let line = line.unwrap();

@@ -17,18 +17,18 @@ use trainer::training::run::{self, Outcome};
 use trainer::training::sampler::Sampler;
 use wire::demonstration::RecordedEpisode;
 
-/// A little past where the hands end, as a block lies past the hand that pokes it.
+/// Goal position, 1 cm beyond the hand's final position, as a block is beyond the hand that pokes it.
 const GOAL: [f32; 3] = [0.71, 0.0, 0.2];
 const STARTS: [[f32; 3]; 4] = [[0.65, -0.03, 0.2], [0.63, 0.02, 0.22], [0.64, 0.0, 0.17], [0.66, 0.03, 0.19]];
 const ACTIONS: u32 = 8;
 
-/// Where a hand is that goes straight, to 1 cm before the goal.
+/// Position of the hand at a step of a straight path, which ends 1 cm before the goal.
 fn hand(start: [f32; 3], step: u32) -> [f32; 3] {
     let end = [GOAL[0] - 0.01, GOAL[1], GOAL[2]];
     [0, 1, 2].map(|axis| start[axis] + (end[axis] - start[axis]) * step as f32 / ACTIONS as f32)
 }
 
-/// Its demonstration, an action of 1 being 1 cm.
+/// Demonstration of that path; an action of 1 moves the hand by 1 cm.
 fn reach(seed: u64, start: [f32; 3]) -> Episode {
     let mut steps = steps("poke", seed, ACTIONS + 1);
     for step in &mut steps {
@@ -46,7 +46,7 @@ fn config(folder: &Path) -> Config {
     }
     let config = Config::from(Preset::Jenga);
     let training = Training { epochs: 150, batch_size: 16, ..config.training };
-    // Short plans are learnt from the few demonstrations there are here.
+    // Short plans can be learnt from few demonstrations.
     let model = ModelConfig { horizon: 1, updates: 1, ..config.model };
     Config { dataset, out: folder.join("jenga.safetensors"), model, training, ..config }
 }
@@ -69,7 +69,7 @@ fn end(model: &Model, mut hand: [f32; 3]) -> [f32; 3] {
 }
 
 #[test]
-fn a_model_of_positions_learns_where_to_go() {
+fn a_model_of_positions_learns_to_reach_a_goal() {
     let folder = tempfile::tempdir().unwrap();
     let config = config(folder.path());
     let outcome = run::run(&config, &mut StopIf(|_| false)).unwrap();
@@ -82,7 +82,7 @@ fn a_model_of_positions_learns_where_to_go() {
 }
 
 #[test]
-fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() {
+fn final_goals_are_recorded_goals_and_earlier_ones_hand_positions() {
     let folder = tempfile::tempdir().unwrap();
     let Config { dataset, .. } = config(folder.path());
     let dataset = Dataset::load(&dataset, &[], Input::Position).unwrap();
@@ -106,7 +106,7 @@ fn the_last_goal_is_the_recorded_one_and_an_earlier_one_is_where_the_hand_was() 
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn mismatched_datasets_and_settings_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = config(folder.path());
     let refusal = |config: &Config| format!("{:#}", run::run(config, &mut StopIf(|_| false)).unwrap_err());

@@ -78,6 +78,7 @@ async fn a_run_mirrors_demonstrations_until_it_has_enough() {
     let (trainer, sender) = sessions(endpoint).await;
     let _recorder = record(&trainer, from.path(), Limits::default()).await;
     let (copies, out) = (to.path().join("data"), to.path().join("live.safetensors"));
+
     let start = || {
         let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_cpn-trainer"));
         command.args(["train", "--json", "--preset", "paper-bc", "--set", "training.batch_size=8"]);
@@ -85,6 +86,7 @@ async fn a_run_mirrors_demonstrations_until_it_has_enough() {
         command.args([&copies, Path::new("--out"), &out, Path::new("--run-dir"), &to.path().join("run")]);
         command.kill_on_drop(true).stdout(Stdio::piped()).spawn().unwrap()
     };
+
     let stopped = start();
     while !copies.is_dir() || files(&copies) != files(from.path()) {
         tokio::time::sleep(Duration::from_millis(20)).await;
@@ -94,6 +96,7 @@ async fn a_run_mirrors_demonstrations_until_it_has_enough() {
     assert!(stopped.status.success());
     let told: serde_json::Value = serde_json::from_slice(&stopped.stdout).unwrap();
     assert_eq!(told, serde_json::json!({"interrupted": {"step": 0}}), "three are not enough");
+
     let run = start();
     for seed in 3..5 {
         send::send(&sender, &episode("reach", seed, 4)).await.unwrap();
@@ -101,6 +104,7 @@ async fn a_run_mirrors_demonstrations_until_it_has_enough() {
     let ended = tokio::time::timeout(Duration::from_secs(60), run.wait_with_output()).await.expect("the run to end");
     assert!(ended.unwrap().status.success());
     assert_eq!(files(&copies), files(from.path()));
+
     let trained = cpn::checkpoint::from_bytes(&std::fs::read(out).unwrap()).unwrap().provenance;
     let all = Dataset::load(from.path(), &[], Input::Image).unwrap();
     assert_eq!(trained.data_digest, all.digest());
@@ -151,6 +155,7 @@ fn faults(plant: impl FnOnce(&mut RecordedEpisode, &mut Vec<DemonstrationStep>))
 fn verify_finds_faults_inside_an_episode() {
     let place = "reach/reach-3.mcap: ";
     assert_eq!(faults(|_, _| ()), Vec::<String>::new(), "nothing is wrong before it is planted");
+
     let found = faults(|_, steps| steps[2].frame = steps[1].frame.clone());
     assert_eq!(found, [format!("{place}expected another frame at step 2 than at 1: the hand moved 0.0100 m")]);
     let found = faults(|_, steps| {
@@ -163,6 +168,7 @@ fn verify_finds_faults_inside_an_episode() {
         steps.iter_mut().for_each(|step| step.frame = first.clone());
     });
     assert_eq!(found, [format!("{place}expected frames that change, got the same in every step")]);
+
     let found = faults(|_, steps| steps[3].success = false);
     assert_eq!(found, [format!("{place}expected success at the last step, got none")]);
     let found = faults(|_, steps| {

@@ -1,4 +1,4 @@
-//! A real training run that is killed again and again ends as one that was not.
+//! A real training run that is killed repeatedly has the result of an uninterrupted one.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -15,7 +15,7 @@ use trainer::training::journal::{self, Entry};
 use trainer::training::progress::Progress;
 use trainer::training::tensorboard::{self, Content};
 
-/// Steps of a pass: 21 samples in batches of 2.
+/// Steps of an epoch: 21 samples in batches of 2.
 const STEPS_PER_EPOCH: u64 = 11;
 const EPOCHS: u64 = 12;
 const KILLS: usize = 10;
@@ -38,7 +38,7 @@ impl Run {
         Self { data, out: folder.join(format!("{name}.safetensors")), run_dir: folder.join(name) }
     }
 
-    /// The real process; it saves its state after each step.
+    /// Starts the real process, which saves its state after each step.
     fn start(&self, epochs: u64) -> Child {
         Command::new(env!("CARGO_BIN_EXE_cpn-trainer"))
             .args([
@@ -75,7 +75,7 @@ impl Run {
         self.noted().last().map_or(0, |entry| entry.progress.step)
     }
 
-    /// Waits until a step is done.
+    /// Waits for the end of a step.
     fn reach(&self, step: u64, child: &mut Child) {
         while self.last_step() < step {
             assert!(child.try_wait().unwrap().is_none(), "the run ended before step {step}");
@@ -83,7 +83,7 @@ impl Run {
         }
     }
 
-    /// The scalars of the one event file, as step and tag and value.
+    /// Scalars of the only event file, as step, tag and value.
     fn events(&self) -> Vec<(u64, String, f32)> {
         let files: Vec<_> = std::fs::read_dir(&self.run_dir).unwrap().map(|entry| entry.unwrap().path()).collect();
         let mut files = files.iter().filter(|path| path.to_string_lossy().contains("tfevents"));
@@ -99,13 +99,13 @@ impl Run {
     }
 }
 
-/// What was noted, without what depends on the clock.
+/// Noted progress without the fields that depend on the clock.
 fn timeless(entries: &[Entry]) -> Vec<Progress> {
     entries.iter().map(|entry| Progress { samples_per_second: 0.0, ..entry.progress }).collect()
 }
 
 #[test]
-fn a_run_that_is_killed_ends_as_one_that_was_not() {
+fn a_killed_run_has_the_result_of_an_uninterrupted_one() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, broken) = (Run::new(folder.path(), "whole"), Run::new(folder.path(), "broken"));
     assert!(whole.start(EPOCHS).wait_with_output().unwrap().status.success());
@@ -114,7 +114,7 @@ fn a_run_that_is_killed_ends_as_one_that_was_not() {
     for _ in 0..KILLS {
         let mut child = broken.start(EPOCHS);
         broken.reach(broken.last_step() + rng.random_range(1..4), &mut child);
-        // Some time from then on: in a step, in a save, or between.
+        // Killed at a random moment: in a step, in a save, or between them.
         std::thread::sleep(Duration::from_micros(rng.random_range(0..20_000)));
         child.kill().unwrap();
         child.wait().unwrap();
@@ -138,7 +138,7 @@ fn a_run_that_is_killed_ends_as_one_that_was_not() {
 }
 
 #[test]
-fn a_run_that_is_terminated_saves_its_state() {
+fn a_terminated_run_saves_its_state() {
     let folder = tempfile::tempdir().unwrap();
     let run = Run::new(folder.path(), "run");
     let mut child = run.start(1000);
@@ -160,9 +160,9 @@ fn a_run_that_is_terminated_saves_its_state() {
     assert!(steps.windows(2).all(|pair| pair[1] > pair[0]), "{steps:?}");
 }
 
-/// A run whose starter has died ends as if it was told to.
+/// A run whose parent process has died, so that its output is closed, is interrupted.
 #[test]
-fn a_run_that_nobody_reads_saves_its_state() {
+fn a_run_with_a_closed_output_saves_its_state() {
     let folder = tempfile::tempdir().unwrap();
     let run = Run::new(folder.path(), "run");
     let mut child = run.start(1000);

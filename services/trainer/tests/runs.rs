@@ -58,6 +58,7 @@ impl Fixture {
         let ours = SessionConfig { namespace: namespace.clone(), ..SessionConfig::default() };
         let session = service_kit::session::open(&ours).await.unwrap();
         let connect = session.info().locators().await.iter().map(ToString::to_string).collect();
+
         let service = service::start(service::Config {
             name: NAME.into(),
             dataset: folder.join("data"),
@@ -70,6 +71,7 @@ impl Fixture {
         })
         .await
         .unwrap();
+
         let fixture = Self {
             channel: Channel::from_shared(format!("http://{}", service.grpc_address()))
                 .unwrap()
@@ -235,6 +237,7 @@ async fn every_transport_starts_and_watches_runs() {
         let name = client.transport();
         let started = client.start(request(name, SHORT)).await.unwrap();
         assert_eq!(started, Run { name: name.into(), state: RunState::Running, progress: None }, "{name}");
+
         let heard = client.to_the_end(name).await;
         let (last, before) = heard.split_last().unwrap();
         assert!(before.iter().all(|run| run.state == RunState::Running), "{name}: {before:?}");
@@ -243,6 +246,7 @@ async fn every_transport_starts_and_watches_runs() {
         // Two epochs of 14 samples in batches of 4.
         let progress = last.progress.unwrap();
         assert_eq!((progress.step, progress.steps, progress.epoch, progress.samples), (8, 8, 2, 28), "{name}");
+
         let RunState::Finished { digest } = &last.state else { panic!("{name}: {last:?}") };
         digests.push(digest.clone());
         assert_eq!(client.list().await.unwrap().iter().find(|run| run.name == name), Some(last));
@@ -288,6 +292,7 @@ async fn every_transport_stops_and_resumes_runs() {
 async fn every_transport_refuses_the_same_requests() {
     let folder = folder();
     let fixture = Fixture::start(folder.path()).await;
+
     let with = |settings: &str| request("wrong", settings);
     let cases = [
         (request("Wrong", SHORT), "name"),
@@ -303,6 +308,7 @@ async fn every_transport_refuses_the_same_requests() {
         (proto::StartRunRequest { seed: Some(u64::MAX), ..with(SHORT) }, "seed"),
         (proto::StartRunRequest { hold_out: vec!["Door".into()], ..with(SHORT) }, "hold_out"),
     ];
+
     for (request, field) in cases {
         let mut errors = Vec::new();
         for client in fixture.clients() {
@@ -312,6 +318,7 @@ async fn every_transport_refuses_the_same_requests() {
         }
         assert!(errors.iter().all(|error| *error == errors[0]), "{errors:?}");
     }
+
     let unknown = Error::new(Code::NotFound, "name", "the name of a run", "\"nobody\"");
     for client in fixture.clients() {
         assert_eq!(client.stop("nobody").await.unwrap_err(), unknown);
@@ -371,6 +378,7 @@ async fn a_run_whose_folder_was_removed_is_started_anew() {
         std::fs::remove_dir_all(folder.path().join("runs/run")).unwrap();
         assert_eq!(client.list().await.unwrap(), [], "{}", client.transport());
     }
+
     // Files of others in the folder are not runs, damaged or not.
     std::fs::create_dir(folder.path().join("runs/.Trash-1000")).unwrap();
     let config = trainer::runs::Config {

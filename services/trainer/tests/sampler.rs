@@ -1,4 +1,4 @@
-//! What a run is fed: each sample once an epoch, the right goals, frames once a batch.
+//! Samples, goals and batches of a training run.
 
 #![expect(clippy::unwrap_used, reason = "a test")]
 
@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use trainer::training::dataset::Dataset;
 use trainer::training::sampler::{Sample, Sampler};
 
-/// Steps of the episodes, the last without an action.
+/// Number of steps of each episode; the last step has no action.
 const STEPS: [u32; 3] = [9, 23, 14];
 
 fn dataset() -> Dataset {
@@ -30,7 +30,7 @@ fn recipe(change: impl FnOnce(&mut Training)) -> Recipe {
 }
 
 #[test]
-fn every_moment_is_seen_once_an_epoch_and_the_order_is_the_seeds() {
+fn an_epoch_has_each_sample_once_in_an_order_by_seed() {
     let dataset = dataset();
     for samples_per_draw in [1, 4, 100] {
         let recipe = recipe(|training| training.samples_per_draw = samples_per_draw);
@@ -47,7 +47,7 @@ fn every_moment_is_seen_once_an_epoch_and_the_order_is_the_seeds() {
 }
 
 #[test]
-fn goals_lie_where_the_recipe_says() {
+fn goals_follow_the_recipe() {
     let dataset = dataset();
     let reach = |goals, action_block| {
         let recipe = recipe(|training| (training.goals, training.action_block) = (goals, action_block));
@@ -65,9 +65,9 @@ fn goals_lie_where_the_recipe_says() {
     assert!(farthest > 10 && at_the_end < all / 2, "{farthest} {at_the_end}");
 }
 
-/// Frames, actions and mask of a batch against the recordings themselves.
+/// Frames, actions and mask of a batch against the recordings.
 #[test]
-fn a_batch_is_what_was_recorded() {
+fn a_batch_matches_the_recordings() {
     let dataset = dataset();
     let (horizon, size) = (ModelConfig::paper(cpn::MethodKind::Cpn).horizon as u32, 4);
     for (goals, block) in [(GoalSampling::Final, 1), (GoalSampling::Hindsight, 1), (GoalSampling::Final, 3)] {
@@ -75,9 +75,11 @@ fn a_batch_is_what_was_recorded() {
         let sampler = Sampler::new(&dataset, &recipe, 3);
         let samples = sampler.epoch(0);
         let batch = sampler.batch(0, &samples);
+
         let frames = batch.frames.observed();
         let distinct: BTreeSet<_> = samples.iter().flat_map(|s| [(s.episode, s.step), (s.episode, s.goal)]).collect();
         assert_eq!(frames.len(), distinct.len(), "each frame once");
+
         let (actions, mask) = (&batch.actions, &batch.mask);
         for (row, s) in samples.iter().enumerate() {
             let recorded = |number| step("reach", s.episode.into(), STEPS[s.episode as usize], number);
@@ -101,7 +103,7 @@ fn a_batch_is_what_was_recorded() {
 
 /// Samples that are drawn together share their goal's frame.
 #[test]
-fn drawing_together_saves_frames() {
+fn samples_drawn_together_share_frames() {
     let dataset = dataset();
     let frames = |samples_per_draw| {
         let recipe = recipe(|training| training.samples_per_draw = samples_per_draw);
@@ -116,9 +118,9 @@ fn drawing_together_saves_frames() {
     assert_eq!((frames, episodes), (9, 1));
 }
 
-/// A run that begins in the middle of an epoch sees what it would have seen.
+/// A run resumed within an epoch gets the batches of an uninterrupted run.
 #[test]
-fn batches_go_on_from_any_step() {
+fn batches_continue_from_any_step() {
     let dataset = dataset();
     let recipe = recipe(|training| (training.batch_size, training.shift_pixels) = (8, 4));
     let sampler = Sampler::new(&dataset, &recipe, 3);

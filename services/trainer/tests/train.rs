@@ -27,7 +27,7 @@ fn config(folder: &Path, name: &str) -> Config {
     Config { dataset, out, seed: 4, ..quick(Preset::Cpn.into(), 2, 6) }
 }
 
-/// The same with other passes and samples of a step.
+/// Short training settings: epochs and batch size are given.
 fn quick(config: Config, epochs: u32, batch_size: usize) -> Config {
     let training = Training { epochs, batch_size, samples_per_draw: 3, ..config.training.clone() };
     Config { training, ..config }
@@ -56,10 +56,10 @@ fn an_interrupted_run_ends_with_the_same_weights() {
     assert!(!broken.out.with_extension("resume").exists());
 }
 
-/// Notes what it hears until it has heard of so many steps.
+/// Observer that collects the progress, and interrupts the run after `until` steps.
 struct Notes {
     began: Vec<u64>,
-    heard: Vec<Progress>,
+    noted: Vec<Progress>,
     until: u64,
 }
 
@@ -74,30 +74,30 @@ impl Observer for Notes {
     }
 
     fn observe(&mut self, progress: &Progress) -> anyhow::Result<()> {
-        self.heard.push(*progress);
+        self.noted.push(*progress);
         Ok(())
     }
 }
 
-/// What is told of a run that was interrupted is what is told of one that was not.
+/// The progress of an interrupted and resumed run equals that of an uninterrupted one.
 #[test]
-fn progress_goes_on_after_an_interruption() {
+fn progress_continues_after_an_interruption() {
     let folder = tempfile::tempdir().unwrap();
-    let mut whole = Notes { began: Vec::new(), heard: Vec::new(), until: u64::MAX };
+    let mut whole = Notes { began: Vec::new(), noted: Vec::new(), until: u64::MAX };
     run::run(&config(folder.path(), "whole"), &mut whole).unwrap();
-    let mut broken = Notes { began: Vec::new(), heard: Vec::new(), until: 5 };
+    let mut broken = Notes { began: Vec::new(), noted: Vec::new(), until: 5 };
     let config = config(folder.path(), "broken");
     run::run(&config, &mut broken).unwrap();
     broken.until = u64::MAX;
     run::run(&config, &mut broken).unwrap();
     assert_eq!((whole.began, broken.began), (vec![0], vec![0, 5]));
 
-    let timeless = |heard: Vec<Progress>| -> Vec<Progress> {
-        heard.into_iter().map(|progress| Progress { samples_per_second: 0.0, ..progress }).collect()
+    let timeless = |noted: Vec<Progress>| -> Vec<Progress> {
+        noted.into_iter().map(|progress| Progress { samples_per_second: 0.0, ..progress }).collect()
     };
-    let (whole, broken) = (timeless(whole.heard), timeless(broken.heard));
+    let (whole, broken) = (timeless(whole.noted), timeless(broken.noted));
     assert_eq!(whole, broken);
-    // 21 samples in batches of 6, twice.
+    // Two epochs of 21 samples in batches of 6.
     assert_eq!(whole.iter().map(|progress| progress.samples).collect::<Vec<_>>(), [6, 12, 18, 21, 27, 33, 39, 42]);
     assert_eq!(whole.iter().map(|progress| progress.epoch).collect::<Vec<_>>(), [0, 0, 0, 1, 1, 1, 1, 2]);
     assert!(whole.iter().all(|progress| progress.gradient_norm > 0.0 && progress.learning_rate > 0.0));
@@ -105,7 +105,7 @@ fn progress_goes_on_after_an_interruption() {
 }
 
 #[test]
-fn a_state_of_another_run_is_not_taken_up() {
+fn a_saved_state_of_another_run_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let first = config(folder.path(), "same");
     run::run(&first, &mut StopIf(|step| step == 1)).unwrap();
@@ -114,7 +114,7 @@ fn a_state_of_another_run_is_not_taken_up() {
 }
 
 #[test]
-fn the_checkpoint_tells_where_it_comes_from() {
+fn a_checkpoint_has_its_provenance() {
     let folder = tempfile::tempdir().unwrap();
     for method in MethodKind::ALL {
         let config = config(folder.path(), method.name());
@@ -130,9 +130,9 @@ fn the_checkpoint_tells_where_it_comes_from() {
     }
 }
 
-/// What a preset prints is what it is, and can be changed from a file, by name.
+/// A preset round-trips through TOML, and a file, arguments and changes override it.
 #[test]
-fn settings_come_in_layers_over_a_preset() {
+fn settings_are_layered_over_a_preset() {
     for preset in Preset::ALL {
         let printed = toml::to_string(&Config::from(preset)).unwrap();
         assert_eq!(Config::from_toml(&printed).unwrap(), Config::from(preset));
@@ -162,7 +162,7 @@ fn settings_come_in_layers_over_a_preset() {
     assert!(refused("preset=fast").contains("unknown variant"), "{}", refused("preset=fast"));
 }
 
-/// Noise can be learnt by heart: the loss must fall far below that of a policy that knows nothing.
+/// Few random samples can be overfitted: the loss must fall far below that of a nearly untrained policy.
 #[test]
 fn training_lowers_the_loss() {
     let folder = tempfile::tempdir().unwrap();
@@ -220,7 +220,7 @@ fn bad_input_is_named() {
 }
 
 #[test]
-fn settings_are_checked_before_anything_is_read() {
+fn settings_are_checked_before_files_are_read() {
     let load = |change: &str| Config::load(None, &serde_json::json!({"dataset": "nowhere"}), &[change.to_owned()]);
     for (change, reason) in [
         ("threads=0", "threads: expected 1 to 1024, got 0"),
@@ -253,9 +253,9 @@ fn a_checkpoint_is_written_by_one_process() {
     finished(&config);
 }
 
-/// The curve of a run is not that of another whose checkpoint has the same name elsewhere.
+/// Two runs whose checkpoints have the same name in different folders do not share a journal.
 #[test]
-fn a_curve_is_not_lost_to_another_run() {
+fn a_curve_is_not_overwritten_by_another_run() {
     let folder = tempfile::tempdir().unwrap();
     config(folder.path(), "data");
     let run = |out: &str| {
@@ -271,7 +271,7 @@ fn a_curve_is_not_lost_to_another_run() {
     let (success, said) = run("b/x.safetensors");
     assert!(!success && said.contains("run_dir: expected a folder of ") && said.contains("a/x.safetensors"), "{said}");
     assert!(curve() == before && !folder.path().join("b").exists());
-    // The same run anew has it, and so has the other once nothing else is left of the first.
+    // The same run may use the folder again, and the other once the files of the first are removed.
     assert!(run("a/x.safetensors").0);
     assert_ne!(curve(), before);
     std::fs::remove_dir_all(folder.path().join("a")).unwrap();

@@ -76,6 +76,7 @@ fn a_checkpoint_becomes_the_next_version_and_is_promoted() {
         versions.publish("cpn", &bytes).unwrap();
         // The same checkpoint again is no new version.
         versions.publish("cpn", &bytes).unwrap();
+
         let loaded = cpn::checkpoint::from_bytes(&bytes).unwrap();
         let manifest = CheckpointManifest {
             model: "cpn".into(),
@@ -90,6 +91,7 @@ fn a_checkpoint_becomes_the_next_version_and_is_promoted() {
         assert_eq!(listed(&versions), ((1..=number).collect(), number));
         assert_eq!(fetched(&versions, &manifest), bytes);
     }
+
     versions.publish("other", &checkpoint(4)).unwrap();
     let all = versions.list(ListVersionsRequest { model: None }).unwrap().versions;
     let all: Vec<_> = all.iter().map(|version| (version.manifest.model.as_str(), version.manifest.version)).collect();
@@ -127,6 +129,7 @@ fn unknown_models_and_versions_are_named() {
     let versions = open(&folder, 5);
     versions.publish("cpn", &checkpoint(1)).unwrap();
     let before = announced(&versions);
+
     let model = || "gpt".to_owned();
     let errors = [
         (promote(&versions, 2).unwrap_err(), Error::new(Code::NotFound, "version", "one of [1]", 2)),
@@ -146,6 +149,7 @@ fn unknown_models_and_versions_are_named() {
     for (error, expected) in errors {
         assert_eq!(error, expected);
     }
+
     let chunk = |digest: &str, offset_bytes| {
         let request = CheckpointChunkRequest { digest: digest.into(), offset_bytes, length_bytes: 7 };
         versions.chunk(request).unwrap_err()
@@ -320,12 +324,14 @@ fn faulty_checkpoints_are_refused_without_traces() {
     let folder = TempDir::new().unwrap();
     let versions = open(&folder, 5);
     let good = checkpoint(1);
+
     let (mut tensors, mut metadata): (Tensors, serde_json::Value) = archive::from_bytes(&good).unwrap();
     metadata["model"]["hidden"] = 9.into();
     let mismatched = archive::to_bytes(&tensors, &metadata).unwrap();
     metadata["model"]["hidden"] = 5.into();
     tensors.insert("network.trunk.bias".into(), Tensor::new(&[], &[f32::NAN]));
     let misshapen = archive::to_bytes(&tensors, &metadata).unwrap();
+
     for (bytes, reason) in [
         (&good[..good.len() - 1], "safetensors"),
         (&[], "safetensors"),
@@ -337,6 +343,7 @@ fn faulty_checkpoints_are_refused_without_traces() {
         assert_eq!((error.code, error.field.as_str()), (Code::InvalidArgument, "checkpoint"));
         assert!(error.got.contains(reason), "{error}");
     }
+
     assert_eq!(versions.publish("../cpn", &good).unwrap_err().field, "model");
     assert!(!folder.path().join("versions/cpn").exists() && !folder.path().join("cpn").exists());
     assert!(versions.promoted().borrow().is_empty());

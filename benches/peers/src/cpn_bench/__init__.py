@@ -1,1 +1,1 @@
-"""Planning and training in PyTorch, JAX and ONNX Runtime, and the turns they take with ours."""
+"""Benchmarks of CPN against planning and training in PyTorch, JAX and ONNX Runtime, in interleaved turns."""

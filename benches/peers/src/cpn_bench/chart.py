@@ -1,4 +1,4 @@
-"""How rates change as the model and the batch grow."""
+"""Charts of rates against the sizes of model and batch."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,18 +10,18 @@ from cpn_bench.harness import Row
 
 
 def figure() -> Figure:
-    """An empty figure, for panels in a row."""
+    """Empty figure for panels in a row."""
     return Figure(figsize=(12, 3.2), layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes text as text, and the same bytes for the same numbers."""
+    """Writes an SVG with text as text; equal figures give equal bytes."""
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "cpn"}):
         figure.savefig(path, metadata={"Date": None})
 
 
 def draw(rows: Sequence[Row], growth: Mapping[str, Sequence[int]], label: str, path: Path) -> None:
-    """A panel for everything that grows, a line for every contender; both axes are logarithmic where they can be."""
+    """Draws a panel for each varied size, with a line for each contender and a logarithmic axis of rates."""
     wide = figure()
     panels = wide.subplots(1, len(growth), sharey=True)
     for panel, (grown, values) in zip(panels, growth.items(), strict=True):

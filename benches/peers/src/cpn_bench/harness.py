@@ -1,4 +1,4 @@
-"""Turns that contenders take, each a process that works when asked and else waits, and the rows that come of them."""
+"""Interleaved turns of contenders, which are processes that work on request, and the resulting rows."""
 
 import json
 import os
@@ -18,12 +18,12 @@ from scipy.stats import bootstrap
 
 OURS, EAGER, COMPILED, JAX = "ours", "PyTorch eager", "torch.compile", "JAX"
 ENVIRONMENT = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(2**40)}
-"""Of every contender: freed memory is kept, so that its pages are not faulted in anew."""
+"""Of every contender. glibc keeps freed memory, so that its pages are not faulted in again."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured."""
+    """Amount of measurement."""
 
     turns: int
     turn_seconds: float
@@ -34,7 +34,7 @@ MAIN, CURVE, QUICK = Effort(12, 1.0), Effort(5, 1.0), Effort(3, 0.3)
 
 @dataclass(frozen=True)
 class Row:
-    """A comparison; a ratio above 1 says that we are better."""
+    """Comparison of CPN with a peer; a ratio above 1 is in favour of CPN."""
 
     name: str
     ours: float
@@ -47,17 +47,17 @@ class Row:
 
 
 class Contender:
-    """A process that works when asked, and else waits."""
+    """Process that works on request, and idles otherwise."""
 
     def __init__(self, name: str, process: "subprocess.Popen[str]") -> None:
         self.name, self.process = name, process
         self.first = self._answer()
-        """What it says once it is warm."""
+        """First answer, after the warm-up."""
         self.count = 1
-        """How much it does in a turn."""
+        """Number of batches or steps in a turn."""
 
     def ask(self, question: object) -> dict[str, Any]:
-        """Writes a line, and waits for one."""
+        """Writes a line, and waits for the answer."""
         assert self.process.stdin  # noqa: S101 - for the type checker
         self.process.stdin.write(f"{question}\n")
         self.process.stdin.flush()
@@ -71,13 +71,13 @@ class Contender:
         return json.loads(line)
 
     def calibrate(self, seconds: float) -> None:
-        """Sets the count of a turn, so that it takes so long."""
+        """Sets the count of a turn, so that the turn takes `seconds`."""
         self.count = 1
         while (taken := self.ask(self.count)["seconds"]) < seconds:
             self.count = max(self.count + 1, round(self.count * min(8.0, 1.1 * seconds / taken)))
 
     def turn(self) -> float:
-        """How much it does a second."""
+        """Takes a turn; returns the rate, in batches or steps a second."""
         answer = self.ask(self.count)
         for field, value in answer.items():
             if not np.isfinite(value):
@@ -86,24 +86,24 @@ class Contender:
 
 
 def pinned(threads: int) -> list[str]:
-    """What binds a command to as many cores, the same for all."""
+    """Prefix that binds a command to the first `threads` cores."""
     cores = sorted(os.sched_getaffinity(0))[:threads]
     return ["taskset", "--cpu-list", ",".join(map(str, cores))]
 
 
 def check_cores(threads: int) -> None:
-    """For a library that takes as many threads as there are cores to run on, as XLA does."""
+    """Checks the number of threads of a library that uses all available cores, as XLA does."""
     if (cores := len(os.sched_getaffinity(0))) != threads:
         raise ValueError(f"threads: expected {cores}, as the process may run on so many cores, got {threads}")
 
 
 def module(name: str, *options: str) -> list[str]:
-    """The command of a module of ours, in this environment."""
+    """Command of a module of this package, in this environment."""
     return [sys.executable, "-m", f"cpn_bench.{name}", *options]
 
 
 def torch_devices() -> list[str]:
-    """Devices of libtorch to measure on: the processor, and a CUDA device where there is one."""
+    """Devices of libtorch to measure: the processor, and a CUDA device if available."""
     if torch.cuda.is_available():
         return ["cpu", "cuda"]
     print("no CUDA device: no rows for one", flush=True)
@@ -112,7 +112,7 @@ def torch_devices() -> list[str]:
 
 @contextmanager
 def contenders(commands: Mapping[str, Sequence[str]], threads: int) -> Iterator[list[Contender]]:
-    """A process for each command, by its contender's name, warmed up in turn, all bound to the same cores."""
+    """Processes of commands by contender, warmed up one after the other, and bound to the same cores."""
     with ExitStack() as stack:
         started: list[Contender] = []
         for name, command in commands.items():
@@ -130,7 +130,7 @@ def contenders(commands: Mapping[str, Sequence[str]], threads: int) -> Iterator[
 
 
 def agree(started: Sequence[Contender], what: str, setting: str, relative: float, absolute: float = 0) -> None:
-    """Checks that this field of the first answers is the same within the tolerances."""
+    """Checks that the field `what` of the first answers is equal within the tolerances."""
     expected = np.asarray(started[0].first[what])
     for contender in started[1:]:
         got = np.asarray(contender.first[what])
@@ -139,20 +139,20 @@ def agree(started: Sequence[Contender], what: str, setting: str, relative: float
 
 
 def take_turns(started: Sequence[Contender], effort: Effort) -> NDArray[np.float64]:
-    """How much each does a second, `[turns, contenders]`."""
+    """Rates of all contenders in interleaved turns, `[turns, contenders]`."""
     for contender in started:
         contender.calibrate(effort.turn_seconds)
     return np.array([[contender.turn() for contender in started] for _ in range(effort.turns)])
 
 
 def median(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """The median over turns, and the ends of its 95 % bootstrap interval."""
+    """Median over turns, with the bounds of its 95 % bootstrap interval."""
     interval = bootstrap((values,), np.median, rng=0).confidence_interval
     return float(np.median(values)), float(interval.low), float(interval.high)
 
 
 def tell(name: str, peers: Sequence[str], rates: NDArray[np.float64], unit: str, command: str) -> list[Row]:
-    """Prints and answers a row for each peer, of rates in this unit `[turns, 1 + peers]` of which ours is the first."""
+    """Prints and returns a row for each peer, from rates in `unit`, `[turns, 1 + peers]`, with those of CPN first."""
     own, *others = np.median(rates, axis=0)
     rows = []
     for column, (peer, other) in enumerate(zip(peers, others, strict=True), 1):
@@ -167,14 +167,14 @@ def tell(name: str, peers: Sequence[str], rates: NDArray[np.float64], unit: str,
 
 
 def print_stages(name: str, what: str, stages: Mapping[str, float]) -> None:
-    """Where our time goes, from the seconds of each stage."""
+    """Prints the time of CPN's stages, from their seconds."""
     total = sum(stages.values())
     parts = ", ".join(f"{stage} {1e3 * value:.3g} ms ({value / total:.0%})" for stage, value in stages.items())
     print(f"{name:24s} {what}: {parts}", flush=True)
 
 
 def shortfalls(rows: Sequence[Row], floors: Mapping[tuple[str, str], float]) -> list[str]:
-    """What falls below its floor, the least ratio by name and peer."""
+    """Messages for rows below their floors, the minimum ratios by name and peer."""
     return [
         f"{row.name} against {row.peer_name}: expected at least {floor} times, got {row.ratio:.2f}"
         for row in rows

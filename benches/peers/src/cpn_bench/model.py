@@ -1,4 +1,4 @@
-"""What a file of ours says of a model, and its weights."""
+"""Model configuration and weights in a file written by CPN's benches."""
 
 import json
 from dataclasses import dataclass
@@ -9,29 +9,29 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 WEIGHT = "weight."
-"""What a weight's name in a checkpoint is prefixed with in the file."""
+"""Prefix, in the file, of a weight's name in a checkpoint."""
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a checkpoint's `cpn` document says of a model, as far as its mathematics depends on it."""
+    """Part of a checkpoint's model configuration that determines its mathematics."""
 
     method: str
     """`bc`, `te-bc`, `upn` or `cpn`."""
     strides: tuple[int, ...]
-    """Of the encoder's convolutions, in pixels."""
+    """Strides of the encoder's convolutions, in pixels."""
     latent: int
     """Z, the size of an embedding."""
     layer_norm: bool
-    """Whether the embedding is layer-normalised."""
+    """True if the embedding is layer-normalised."""
     horizon: int
-    """H, the number of planned steps."""
+    """H, the planning horizon."""
     updates: int
     """U, the number of gradient updates of a plan."""
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "ModelConfig":
-        """Reads the JSON document of `crates/cpn/src/config.rs`."""
+        """Reads the JSON document of `ModelConfig` in `crates/cpn/src/config.rs`."""
         encoder = document["encoder"]
         return cls(
             method=document["method"],
@@ -44,27 +44,27 @@ class ModelConfig:
 
     @property
     def plans(self) -> bool:
-        """Whether actions come from the inner loop."""
+        """True if actions come from the inner loop."""
         return self.method in ("upn", "cpn")
 
     @property
     def goal_conditioned(self) -> bool:
-        """Whether the policy sees the goal's embedding."""
+        """True if the goal's embedding is an input of the policy."""
         return self.method in ("te-bc", "cpn")
 
     @property
     def neuromodulated(self) -> bool:
-        """Whether the fully connected layers of the policy and the dynamics are gated."""
+        """True if the fully connected layers of policy and dynamics are neuromodulated."""
         return self.method == "cpn"
 
     @property
     def sees_goal(self) -> bool:
-        """Whether the goal's picture is embedded at all."""
+        """True if the goal's image is embedded."""
         return self.plans or self.goal_conditioned
 
 
 def read(path: Path) -> tuple[ModelConfig, dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
-    """The model in a file of ours, its weights by their names in a checkpoint, and the other tensors."""
+    """Reads a model, its weights by their names in a checkpoint, and the other tensors."""
     with safe_open(path, "numpy") as file:
         model = ModelConfig.from_document(json.loads(file.metadata()["cpn"]))
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

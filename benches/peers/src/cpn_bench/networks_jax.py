@@ -1,4 +1,4 @@
-"""The networks in JAX, and how they plan: batched arrays with unrolled steps."""
+"""Networks and planning in JAX, with batched arrays and unrolled steps."""
 
 import jax
 import jax.numpy as jnp
@@ -11,17 +11,17 @@ Weights = dict[str, Array]
 
 
 def linear(weights: Weights, name: str, x: Array) -> Array:
-    """`[B, inputs]` to `[B, outputs]`."""
+    """Linear layer from `[B, inputs]` to `[B, outputs]`."""
     return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
 
 
 def gate(weights: Weights, name: str, x: Array) -> Array:
-    """An attenuation network, with one hidden layer: `[B, inputs]` to `[B, outputs]` in (0, 1)."""
+    """Attenuation network with one hidden layer, from `[B, inputs]` to `[B, outputs]` in (0, 1)."""
     return jax.nn.sigmoid(linear(weights, f"{name}.output", jax.nn.relu(linear(weights, f"{name}.hidden", x))))
 
 
 def dense(weights: Weights, name: str, x: Array) -> Array:
-    """A linear layer, neuromodulated where it has gates."""
+    """Fully connected layer, neuromodulated if it has gates."""
     if f"{name}.u.hidden.weight" not in weights:
         return linear(weights, name, x)
     weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
@@ -30,14 +30,14 @@ def dense(weights: Weights, name: str, x: Array) -> Array:
 
 
 def encode(weights: Weights, model: ModelConfig, images: Array) -> Array:
-    """`[B, 84, 84, 3]` bytes to `[B, Z]`."""
+    """Embeddings `[B, Z]` of images `[B, 84, 84, 3]`, bytes."""
     y = images.astype(weights["encoder.linear.weight"].dtype) / 255 - 0.5
     for number, stride in enumerate(model.strides):
         name = f"encoder.conv.{number}"
         layout = ("NHWC", "OIHW", "NHWC")
         y = lax.conv_general_dilated(y, weights[f"{name}.weight"], (stride, stride), "VALID", dimension_numbers=layout)
         y = jax.nn.relu(y + weights[f"{name}.bias"])
-    # The linear layer's weights are those of an encoder with channels first.
+    # The linear layer's weights expect features with channels first.
     x = linear(weights, "encoder.linear", y.transpose(0, 3, 1, 2).reshape(len(y), -1))
     if model.layer_norm:
         x = jax.nn.standardize(x, epsilon=1e-5) * weights["encoder.norm.weight"] + weights["encoder.norm.bias"]
@@ -45,49 +45,49 @@ def encode(weights: Weights, model: ModelConfig, images: Array) -> Array:
 
 
 def features(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
-    """What the trunk makes of a state."""
+    """Trunk: features of a state."""
     inputs = jnp.concatenate([x, goal], 1) if model.goal_conditioned else x
     return jax.nn.relu(dense(weights, "network.trunk", inputs))
 
 
 def policy(weights: Weights, features: Array) -> Array:
-    """The action for a state's features."""
+    """Policy branch: the action from a state's features."""
     hidden = jax.nn.relu(dense(weights, "network.policy_0", features))
     return jnp.tanh(dense(weights, "network.policy_1", hidden))
 
 
 def next_state(weights: Weights, x: Array, features: Array, action: Array) -> Array:
-    """The state after an action."""
+    """Dynamics branch: the state after an action."""
     hidden = jax.nn.relu(dense(weights, "network.dynamics_0", jnp.concatenate([features, action], 1)))
     return x + dense(weights, "network.dynamics_1", hidden)
 
 
 def rollout(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
-    """The policy's actions along its own predicted states, `[B, H, A]`, from x to the goal, both `[B, Z]`."""
-    seen = features(weights, model, x, goal)
-    actions = [policy(weights, seen)]
+    """Policy's actions along the predicted states, `[B, H, A]`, from x to the goal, both `[B, Z]`."""
+    state_features = features(weights, model, x, goal)
+    actions = [policy(weights, state_features)]
     for _ in range(model.horizon - 1):
-        x = next_state(weights, x, seen, actions[-1])
-        seen = features(weights, model, x, goal)
-        actions.append(policy(weights, seen))
+        x = next_state(weights, x, state_features, actions[-1])
+        state_features = features(weights, model, x, goal)
+        actions.append(policy(weights, state_features))
     return jnp.stack(actions, 1)
 
 
 def inner_losses(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> Array:
-    """Huber between the state predicted after each plan's actions and its goal, `[B]`."""
+    """Huber losses between the predicted state after the plans' actions and the goal, `[B]`."""
     for step in range(model.horizon):
         x = next_state(weights, x, features(weights, model, x, goal), actions[:, step])
     return optax.losses.huber_loss(x, goal).sum(1)
 
 
 def inner_loss(actions: Array, weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, Array]:
-    """The sum, whose gradient is each plan's own, for plans are independent; and the losses."""
+    """Sum of the inner losses, whose gradient is that of each plan since plans are independent, and the losses."""
     losses = inner_losses(actions, weights, model, x, goal)
     return losses.sum(), losses
 
 
 def improve(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, list[Array]]:
-    """The rollout, improved by descent on the predicted distance to the goal; the losses before each update."""
+    """Rollout with gradient updates on the inner loss; returns the actions, and the losses before each update."""
     actions, losses = rollout(weights, model, x, goal), []
     for _ in range(model.updates):
         gradient, before = jax.grad(inner_loss, has_aux=True)(actions, weights, model, x, goal)
@@ -97,6 +97,6 @@ def improve(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tupl
 
 
 def plan(weights: Weights, model: ModelConfig, x: Array, goal: Array) -> tuple[Array, Array]:
-    """Actions `[B, H, A]`, and the losses `[U + 1, B]` before each update and after the last."""
+    """Plans: actions `[B, H, A]`, and inner losses `[U + 1, B]` before each update and after the last."""
     actions, losses = improve(weights, model, x, goal)
     return actions, jnp.stack([*losses, inner_losses(actions, weights, model, x, goal)])

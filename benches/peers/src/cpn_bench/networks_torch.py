@@ -1,4 +1,4 @@
-"""The networks in PyTorch, and how they plan, written as its documentation would have them."""
+"""Networks and planning in PyTorch, in the style of its documentation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ Weights = Mapping[str, Tensor]
 
 
 class Gate(nn.Module):
-    """An attenuation network with one hidden layer."""
+    """Attenuation network with one hidden layer."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
@@ -22,12 +22,12 @@ class Gate(nn.Module):
         self.output = nn.Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`[B, inputs]` to `[B, outputs]` in (0, 1)."""
+        """Factors `[B, outputs]` in (0, 1) of inputs `[B, inputs]`."""
         return torch.sigmoid(self.output(F.relu(self.hidden(x))))
 
 
 class Neuromodulated(nn.Linear):
-    """A linear layer whose weights and biases are attenuated by its input."""
+    """Linear layer with weights and biases attenuated by factors computed from its input."""
 
     def __init__(self, inputs: int, outputs: int, gate_hidden: int) -> None:
         super().__init__(inputs, outputs)
@@ -35,20 +35,20 @@ class Neuromodulated(nn.Linear):
         self.v = Gate(inputs, gate_hidden, outputs)
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - nn.Linear's name
-        """`[B, inputs]` to `[B, outputs]`."""
+        """Outputs `[B, outputs]` of inputs `[B, inputs]`."""
         weight = self.u(input).unflatten(1, self.weight.shape) * self.weight
         return (weight * input.unsqueeze(1)).sum(-1) + self.v(input) * self.bias
 
 
 class Encoder(nn.Module):
-    """Convolutions, a linear layer and a layer norm."""
+    """Encoder: convolutions, a linear layer and layer normalisation."""
 
     def __init__(self, model: ModelConfig, weights: Weights) -> None:
         super().__init__()
         self.conv = nn.ModuleList()
         for number, stride in enumerate(model.strides):
             outputs, inputs, kernel, _ = weights[f"encoder.conv.{number}.weight"].shape
-            # Like the images, whose bytes lie with their channels last.
+            # Channels last, as in the images.
             convolution = nn.Conv2d(inputs, outputs, kernel, stride).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
             self.conv.append(convolution)
         outputs, inputs = weights["encoder.linear.weight"].shape
@@ -56,7 +56,7 @@ class Encoder(nn.Module):
         self.norm = nn.LayerNorm(outputs) if model.layer_norm else nn.Identity()
 
     def forward(self, images: Tensor) -> Tensor:
-        """`[B, 84, 84, 3]` bytes to `[B, Z]`."""
+        """Embeddings `[B, Z]` of images `[B, 84, 84, 3]`, bytes."""
         y = images.permute(0, 3, 1, 2).to(self.linear.weight.dtype) / 255 - 0.5
         for convolution in self.conv:
             y = F.relu(convolution(y))
@@ -64,7 +64,7 @@ class Encoder(nn.Module):
 
 
 class PolicyDynamics(nn.Module):
-    """The trunk with its policy and dynamics branches, g_θ."""
+    """Policy dynamics network g_θ: a trunk with policy and dynamics branches."""
 
     def __init__(self, model: ModelConfig, weights: Weights) -> None:
         super().__init__()
@@ -82,20 +82,20 @@ class PolicyDynamics(nn.Module):
             self.dynamics_0, self.dynamics_1 = dense("dynamics_0"), dense("dynamics_1")
 
     def features(self, x: Tensor, goal: Tensor) -> Tensor:
-        """What the trunk makes of a state."""
+        """Trunk: features of a state."""
         return F.relu(self.trunk(torch.cat([x, goal], 1) if self.goal_conditioned else x))
 
     def policy(self, features: Tensor) -> Tensor:
-        """The action for a state's features."""
+        """Policy branch: the action from a state's features."""
         return torch.tanh(self.policy_1(F.relu(self.policy_0(features))))
 
     def next(self, x: Tensor, features: Tensor, action: Tensor) -> Tensor:
-        """The state after an action."""
+        """Dynamics branch: the state after an action."""
         return x + self.dynamics_1(F.relu(self.dynamics_0(torch.cat([features, action], 1))))
 
 
 class Agent(nn.Module):
-    """Encoder, g_θ and step size, with the parts of a plan."""
+    """Encoder, g_θ and step size, with the parts of planning."""
 
     def __init__(self, model: ModelConfig, weights: Weights) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ class Agent(nn.Module):
         self.to(weights["step_size"].dtype).load_state_dict(weights)
 
     def rollout(self, x: Tensor, goal: Tensor) -> Tensor:
-        """The policy's actions along its own predicted states, `[B, H, A]`, from x to the goal, both `[B, Z]`."""
+        """Policy's actions along the predicted states, `[B, H, A]`, from x to the goal, both `[B, Z]`."""
         features = self.network.features(x, goal)
         actions = [self.network.policy(features)]
         for _ in range(self.model.horizon - 1):
@@ -116,16 +116,16 @@ class Agent(nn.Module):
         return torch.stack(actions, 1)
 
     def inner_losses(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
-        """Huber between the state predicted after each plan's actions and its goal, `[B]`."""
+        """Huber losses between the predicted state after the plans' actions and the goal, `[B]`."""
         for action in actions.unbind(1):
             x = self.network.next(x, self.network.features(x, goal), action)
         return F.huber_loss(x, goal, reduction="none").sum(1)
 
     def inner_loss(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
-        """The sum, whose gradient is each plan's own: plans are independent."""
+        """Sum of the inner losses, whose gradient is that of each plan since plans are independent."""
         return self.inner_losses(actions, x, goal).sum()
 
 
 def tensors(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
-    """Arrays as tensors of the same memory."""
+    """Tensors that share the arrays' memory."""
     return {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -1,4 +1,4 @@
-"""In the place of ours where the harness itself is tested: writes a model of noise, and plans with PyTorch."""
+"""Stand-in for CPN's bench in tests of the harness: writes a random model, and plans with PyTorch."""
 
 import json
 import sys
@@ -19,7 +19,7 @@ FRAMES, CHANNELS, KERNEL, LATENT, HIDDEN, GATE_HIDDEN, ACTIONS, UPDATES = 64, 4,
 
 
 def write(path: Path, method: str, horizon: int = 3) -> None:
-    """A small model with its observations and goals."""
+    """Writes a small model with observations and goals."""
     rng = np.random.default_rng(0)
     weights: dict[str, NDArray[np.float32]] = {"step_size": np.ones((), np.float32)}
 
@@ -54,7 +54,7 @@ def write(path: Path, method: str, horizon: int = 3) -> None:
 
 
 def serve(data: PlanModel, batch: int, action_error: float) -> None:
-    """Answers as ours does."""
+    """Answers requests as CPN's bench does."""
     planner = Planner(data)
     observations, goals = data.frames[:batch], planner.embed(data.goals[:batch])
     actions = planner.plan(observations, goals)[0][0] + action_error
@@ -78,7 +78,7 @@ def main(
     threads: int = 1,
     action_error: float = 0,
 ) -> None:
-    """Takes the options that ours takes; the error is absolute."""
+    """Runs with the options of CPN's bench; the error of the actions is absolute."""
     torch.set_num_threads(threads)
     if write_model:
         write(write_model, method, horizon)

@@ -1,4 +1,4 @@
-"""The harness takes turns with real processes, and says what is wrong with them."""
+"""Harness of the planning bench, with real processes."""
 
 import json
 import sys
@@ -40,7 +40,7 @@ def test_turns_become_rows(capfd: pytest.CaptureFixture[str]) -> None:
     assert "GFLOP/s of a large product" in printed
 
 
-def test_what_grows_is_asked_of_ours() -> None:
+def test_varied_sizes_are_passed_on() -> None:
     (row,) = bench.compare(OURS, [EAGER], bench.Setting("upn", grown="horizon", value=2), EFFORT)
     assert row.name == "upn, horizon 2"
 
@@ -51,7 +51,7 @@ def test_contenders_must_agree_on_the_first_plan() -> None:
         bench.compare(tilted, [EAGER], bench.Setting("cpn"), EFFORT)
 
 
-def test_what_is_below_its_floor_is_named() -> None:
+def test_rows_below_their_floor_are_named() -> None:
     rows = [
         row("cpn, batch 1, 1 thread", EAGER, 19.9),
         row("cpn, batch 1, 1 thread", JAX, 2.0),
@@ -80,8 +80,8 @@ def test_our_service_is_measured_by_its_bench() -> None:
     assert measured == ([Measurement("gRPC", 1, 2.0, 1.0, 3.0, 9, 0.5)], overload)
 
 
-def test_what_a_service_costs_is_told_turn_by_turn(capfd: pytest.CaptureFixture[str]) -> None:
-    # In three turns the machine is slow, fast and in between.
+def test_the_cost_of_a_service_is_computed_turn_by_turn(capfd: pytest.CaptureFixture[str]) -> None:
+    # Three turns on a machine that is slow, fast and medium.
     turns = [
         Measurement(transport, clients, rate * speed, p50, 2 * p50, 10, server)
         for speed, share, wait in ((1.0, 0.7, 0.4), (3.0, 0.8, 0.5), (2.0, 0.9, 0.6))
@@ -104,7 +104,7 @@ def test_services_become_rows() -> None:
     assert (rows["gRPC, 32 clients"].ratio, rows["gRPC, 32 clients"].unit) == (pytest.approx(2.0), "plans/s")
 
 
-def test_the_charts_show_what_grows(tmp_path: Path) -> None:
+def test_charts_show_varied_sizes(tmp_path: Path) -> None:
     growth = {"horizon": (1, 5), "updates": (0, 1)}
     rows = [row(f"cpn, {grown} {v}", peer, v + 1) for grown in growth for v in growth[grown] for peer in (EAGER, JAX)]
     chart.draw(rows, growth, "plans/s, batch 1, one thread", tmp_path / "plan.svg")

@@ -1,4 +1,4 @@
-"""The peers plan what the golden tensors of `tests/golden/reference.py` say, and their rollouts are one another's."""
+"""Plans of the peers against the golden tensors of `tests/golden/reference.py`, and their rollouts."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +24,7 @@ def by_torch(data: PlanModel) -> Plans:
 
 def by_compiled_torch(data: PlanModel) -> Plans:
     planner = peer_torch.Planner(data)
-    # Traced as the peer is, without the minute that generated code takes.
+    # Traced like the peer, without code generation, which takes a minute.
     planner.plan_tensors = torch.compile(planner.traced, fullgraph=True, backend="aot_eager")
     return planner.plan(data.frames, planner.embed(data.goals))
 
@@ -45,7 +45,7 @@ def test_plans_are_golden(peer: Callable[[PlanModel], Plans], method: str) -> No
 
 
 @pytest.mark.parametrize("method", ["upn", "cpn"])
-def test_onnx_rolls_out_as_torch_does(tmp_path: Path, method: str) -> None:
+def test_rollouts_of_onnx_and_torch_are_equal(tmp_path: Path, method: str) -> None:
     plan_stand_in.write(tmp_path / "model.safetensors", method)
     data = PlanModel.read(tmp_path / "model.safetensors")
     batch = 3
@@ -56,10 +56,10 @@ def test_onnx_rolls_out_as_torch_does(tmp_path: Path, method: str) -> None:
     np.testing.assert_allclose(rolled_out, planner.agent.rollout(x, goals).numpy(), rtol=1e-5, atol=1e-6)
 
 
-def test_operations_are_those_that_torch_counts(tmp_path: Path) -> None:
+def test_operations_agree_with_torchs_counter(tmp_path: Path) -> None:
     from torch.utils.flop_counter import FlopCounterMode
 
-    # Without gates, whose products with the state are no matrix products of torch's.
+    # Without gates, whose products torch does not compute as matrix products.
     plan_stand_in.write(tmp_path / "model.safetensors", "upn")
     data = PlanModel.read(tmp_path / "model.safetensors")
     planner = peer_torch.Planner(data)

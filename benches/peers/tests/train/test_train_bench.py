@@ -1,4 +1,4 @@
-"""The harness takes turns with real processes, and says what is wrong with them."""
+"""Harness of the training bench, with real processes."""
 
 import sys
 from pathlib import Path
@@ -31,12 +31,12 @@ def test_contenders_must_agree_on_the_first_loss() -> None:
 
 
 def test_a_contender_that_dies_is_named() -> None:
-    # The stand-in knows BC only, and so refuses its own batches.
+    # The stand-in supports only BC, and refuses its batches for another method.
     with pytest.raises(RuntimeError, match="ours: expected an answer"):
         bench.compare(OURS, [harness.EAGER], bench.Setting("te-bc"), EFFORT)
 
 
-def test_what_is_below_its_floor_is_named() -> None:
+def test_rows_below_their_floor_are_named() -> None:
     rows = [
         row("cpn, 1 thread", harness.EAGER, 3.9),
         row("cpn, 1 thread", harness.JAX, 2.0),
@@ -49,7 +49,7 @@ def test_what_is_below_its_floor_is_named() -> None:
     ]
 
 
-def test_the_chart_has_a_panel_for_what_grows(tmp_path: Path) -> None:
+def test_the_chart_has_a_panel_for_each_varied_size(tmp_path: Path) -> None:
     rows = [row(f"cpn, horizon {value}", peer, value) for value in (1, 5) for peer in (harness.EAGER, harness.JAX)]
     rows += [row(f"cpn, batch {value}", peer, value) for value in (32, 128) for peer in (harness.EAGER, harness.JAX)]
     chart.draw(rows, {"horizon": (1, 5), "batch": (32, 128)}, "samples/s", tmp_path / "train.svg")

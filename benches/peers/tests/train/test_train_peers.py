@@ -1,4 +1,4 @@
-"""The peers compute what the golden tensors of `tests/golden/reference.py` say, so that all contenders do the same."""
+"""Losses and gradients of the peers against the golden tensors of `tests/golden/reference.py`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ Gradients = dict[str, NDArray[Any]]
 
 
 def golden(method: str) -> tuple[Batches, float, Gradients]:
-    """One batch in float64, its outer loss and gradients."""
+    """One batch in float64, with its outer loss and gradients."""
     model, weights, tensors = read(GOLDEN / f"{method}.safetensors")
     size = len(tensors["observations"])
     batches = Batches(
@@ -38,7 +38,7 @@ def golden(method: str) -> tuple[Batches, float, Gradients]:
 
 def by_torch(batches: Batches, compiled: bool = False) -> tuple[float, Gradients]:
     trainer = peer_torch.Trainer(batches)
-    # Traced as the peer is, without the minutes that generated code takes.
+    # Traced like the peer, without code generation, which takes minutes.
     outer_loss = torch.compile(trainer.agent, fullgraph=True, backend="aot_eager") if compiled else trainer.agent
     loss = outer_loss(*trainer.batch(0))
     weights = dict(trainer.agent.named_parameters())

@@ -1,4 +1,4 @@
-"""In the place of ours where the harness itself is tested: writes batches of noise, and trains with PyTorch."""
+"""Stand-in for CPN's bench in tests of the harness: writes random batches, and trains with PyTorch."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ BATCHES, BATCH, FRAMES, LATENT, HIDDEN, ACTIONS = 3, 4, 7, 8, 6, 4
 
 
 def write(path: Path) -> None:
-    """A small BC model with its batches."""
+    """Writes a small BC model with batches."""
     rng = np.random.default_rng(0)
 
     def noise(*shape: int) -> NDArray[np.float32]:
@@ -55,7 +55,7 @@ def write(path: Path) -> None:
 
 
 def serve(trainer: Trainer, loss_error: float) -> None:
-    """Answers as ours does."""
+    """Answers requests as CPN's bench does."""
     print(json.dumps({"ready": True, "loss": trainer.step(0)() * (1 + loss_error)}), flush=True)
     for line in sys.stdin:
         if line == "stages\n":
@@ -73,7 +73,7 @@ def main(
     threads: int = 1,
     loss_error: float = 0,
 ) -> None:
-    """Takes the options that ours takes; the error is relative."""
+    """Runs with the options of CPN's bench; the error of the loss is relative."""
     torch.set_num_threads(threads)
     if write_batches:
         write(write_batches)

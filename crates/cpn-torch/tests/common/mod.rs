@@ -7,29 +7,29 @@ use cpn_torch::loss::TensorBatch;
 use cpn_torch::{Agent, tensors};
 use tch::{Device, Kind, Tensor};
 
-/// An agent in float64, so that gradients can be told from rounding.
+/// An agent in float64, so that errors of gradients exceed rounding.
 pub fn double_agent(model: &Model) -> Agent {
     let mut agent = Agent::new(model, Device::Cpu);
     agent.variables_mut().double();
     agent
 }
 
-/// A double agent with initial weights.
+/// An agent in float64 with initial weights.
 pub fn new_agent(config: ModelConfig) -> Agent {
     double_agent(&Model::new(config, 3))
 }
 
-/// Images of noise, `[B, 84, 84, 3]`.
+/// Random images, `[B, 84, 84, 3]`.
 pub fn noise_images(batch: usize, seed: u64) -> Tensor {
     tensors::from_images(&testing::noise_images(batch, seed))
 }
 
-/// Values in [-1, 1), float64.
+/// Random values in [-1, 1), float64.
 pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
     Tensor::from_slice(&testing::uniform(shape.iter().product::<i64>() as usize, seed)).view(shape)
 }
 
-/// A batch of observations, each with a goal of its own.
+/// A batch with a separate goal for each observation.
 pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> TensorBatch {
     let count = observations.size()[0];
     let rows = |first| Tensor::arange_start(first, first + count, (Kind::Int64, Device::Cpu));

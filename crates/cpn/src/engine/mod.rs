@@ -1,25 +1,26 @@
-//! Engines, and the native one: the outer loss and its gradient without an autograd graph, the passes over g_θ derived by hand.
+//! Interface of engines, and the native engine: plans, the outer loss and its gradient by hand-derived passes over g_θ, without an
+//! autograd graph.
 //!
 //! A training step differentiates through the inner loop, and so through a gradient. In terms of one layer y = f(x):
 //!
-//! | pass | computes | what it is for |
+//! | pass | computes | purpose |
 //! |---|---|---|
 //! | forward | y | the rollout |
 //! | backward | x̄ = (∂y/∂x)ᵀ ȳ | the inner loop's gradient in the actions |
-//! | tangent | ẏ = (∂y/∂x) ẋ | how that gradient acts along the direction the outer loss gives |
+//! | tangent | ẏ = (∂y/∂x) ẋ | directional derivative of that gradient, along the direction given by the outer loss |
 //! | adjoint | x̂ = ∂Φ/∂x and ∂Φ/∂θ, Φ = ŷᵀy + ȳᵀẏ | the outer gradient, both orders in one pass |
 //!
-//! The last row is what makes this cheap: the adjoint of ẏ is ȳ, which the inner loop has computed already, so that the
-//! second order costs two passes more than the first and nothing is recorded but what the passes leave on a [tape](layers::dense).
-//! In the words of JAX and PyTorch, and of the code, backward is `vjp`, tangent `jvp` and adjoint `double_backward`; an adjoint of
-//! the first order alone, as in the encoder, is a `vjp` with the weights among its inputs.
+//! The cotangent of ẏ is ȳ, which the inner loop has computed already. The second order thus costs two passes more than the
+//! first, and needs no record besides the [tapes](layers::dense) of the passes. In the code, as in JAX and PyTorch, backward is
+//! `vjp`, tangent `jvp` and adjoint `double_backward`; an adjoint of the first order alone, as in the encoder, is a `vjp` with the
+//! weights among its inputs.
 //! The same quantities serve both branches of g_θ, and the policy's rollout is also the first rollout of the inner loop.
 //!
-//! Six storeys, each of which uses only those before it: `simd` (registers), `gemm` (matrix products), `layers`, `networks`,
+//! Six modules, each of which uses only those before it: `simd` (registers), `gemm` (matrix products), `layers`, `networks`,
 //! `planning` (the inner loop) and `training` (the outer loop).
 //!
-//! A block of samples goes through all of that before the next one does, so that its tapes stay in the processor's caches. The
-//! encoder f_φ is of the first order only: it goes forward over all frames, and back when their gradients are known
+//! All passes of a block of samples are computed before the next block, so that its tapes stay in the processor's caches. The
+//! encoder f_φ is of the first order only: forward over all frames, and backward after their gradients are known
 //! ([`EncoderPass`]). Tested against autograd in float64 (`crates/cpn-torch/tests/gradients.rs`).
 
 pub(crate) mod gemm;
@@ -45,22 +46,22 @@ pub use training::learner::NativeLearner;
 pub use training::outer_loop::{OuterLoop, Samples};
 pub use training::outer_loss::{Gradient, OuterLoss};
 
-/// Computes plans and training steps of a model.
+/// An engine: computation of a model's plans and training steps on a device.
 pub trait Engine: Debug + Send + Sync {
-    /// A planner of a model whose weights fit its configuration, with images embedded in this precision where the engine has it.
+    /// A planner of a valid model, with images embedded in `precision` if the engine supports it.
     ///
     /// # Errors
-    /// If the device fails, with the option to change.
+    /// If the device fails; the error names the option to change.
     fn planner(&self, model: &Model, precision: Precision) -> Result<Box<dyn Method>, EngineError>;
 
-    /// Training of a model by valid settings.
+    /// A learner of a valid model, with valid settings.
     ///
     /// # Errors
-    /// If the device fails, with the option to change.
+    /// If the device fails; the error names the option to change.
     fn learner(&self, model: Model, training: &Training) -> Result<Box<dyn Learner>, EngineError>;
 }
 
-/// A device that cannot be computed on.
+/// Error of a device.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct EngineError(pub String);

@@ -1,23 +1,23 @@
-//! Gradient descent down the inner loss, for a block of plans at a time.
+//! Gradient descent on the inner loss, for a block of plans.
 
 use super::block::{Actions, PlanBlock, Purpose};
 use super::query::{Plan, Query};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A descent for R plans, at most a block's capacity. It can be suspended after any update and resumed.
+/// Gradient descent of R plans, at most a block's capacity. It can be suspended after any update and resumed.
 #[derive(Debug)]
 pub struct Descent {
-    /// Identity of the descent, by which it finds its rollout in a block's memory.
+    /// Identity of the descent, which marks its rollout in a block's memory.
     id: u64,
     pub plans: Vec<Plan>,
-    /// Number of updates that were made.
+    /// Number of updates so far.
     pub done: usize,
-    /// Actions after the last update, `[R][H][A]`, while the block's memory serves others.
+    /// Actions after the last update, `[R][H][A]`, while the block's memory is used by other searches.
     suspended: Option<Vec<Vec<Vec<f32>>>>,
 }
 
 impl Descent {
-    /// The first rollout, from the policy's actions or from the queries' own; either all queries have some or none.
+    /// The first rollout, from the policy's actions or from the queries' start; either all queries have a start or none.
     pub fn begin(block: &mut impl PlanBlock, queries: &[Query<'_>]) -> Self {
         let rows = queries.len();
         let source = if queries[0].start.is_empty() { Actions::Proposed } else { Actions::Given };
@@ -35,8 +35,8 @@ impl Descent {
         Self { id: new_id(), plans: losses.into_iter().enumerate().map(begun).collect(), done: 0, suspended: None }
     }
 
-    /// One update, for a method that plans: `last` if it is known that none follows; with `keep_best` the best plan counts, else
-    /// the last.
+    /// One update, for a searchable method. `last`: no update follows, so that no gradient is needed. `keep_best`: the result is
+    /// the best plan, else the last.
     pub fn update(&mut self, block: &mut impl PlanBlock, queries: &[Query<'_>], last: bool, keep_best: bool) {
         let rows = queries.len();
         if rows == 0 {
@@ -46,7 +46,7 @@ impl Descent {
 
         let suspended = self.suspended.take().filter(|_| *block.resident() != Some(self.id));
         if let Some(suspended) = suspended {
-            // The gradient needs the tapes of these actions' rollout; it comes out the same again.
+            // The gradient needs the tapes of these actions' rollout: repeated, it gives equal values.
             for (r, plan) in suspended.iter().enumerate() {
                 block.set_plan(rows, r, plan);
             }
@@ -71,7 +71,7 @@ impl Descent {
 
     /// Copies the state of the next update out of the block's memory.
     pub fn suspend(&mut self, block: &mut impl PlanBlock) {
-        // A descent that is suspended already may have nothing in the memory any more.
+        // The block's memory may hold another search by now if this one was suspended before.
         if self.suspended.is_none() {
             let rows = self.plans.len();
             self.suspended = Some((0..rows).map(|r| block.plan(rows, r)).collect());
@@ -82,7 +82,7 @@ impl Descent {
     /// Removes a plan of a suspended descent.
     pub fn remove(&mut self, r: usize) {
         self.plans.remove(r);
-        // The rollout in memory is one of all.
+        // A new identity, since the rollout in memory includes the removed plan.
         self.id = new_id();
         self.suspended.as_mut().map(|suspended| suspended.remove(r));
     }

@@ -1,4 +1,4 @@
-//! Searches for plans. They know g_θ by the rollouts of a [`PlanBlock`] alone, whichever engine computes them.
+//! Searches for plans, independent of the engine: g_θ is evaluated only by the rollouts of a [`PlanBlock`].
 
 pub mod block;
 pub(crate) mod descent;

@@ -1,11 +1,11 @@
-//! Searches in pieces.
+//! Searches in pieces, to be suspended and resumed.
 
 use super::descent::Descent;
 use super::query::{Plan, Solver, rollouts};
 use super::sampling::SamplingSearch;
 
-/// A search in pieces, by [`Method::resume`](crate::Method::resume). The division into pieces changes no bit of the plans, which
-/// are those of [`Method::plan`](crate::Method::plan).
+/// State of a search in pieces, by [`Method::resume`](crate::Method::resume). The plans are bit for bit those of
+/// [`Method::plan`](crate::Method::plan), for any division into pieces.
 #[derive(Debug)]
 pub struct Ongoing {
     pub(crate) solver: Solver,
@@ -18,15 +18,15 @@ pub struct Ongoing {
 #[derive(Debug)]
 pub(crate) enum State {
     New,
-    /// A descent for each thread.
+    /// One descent per thread.
     Descents(Vec<Descent>),
     Sampling(Box<SamplingSearch>),
-    /// A search that was done at once.
+    /// Result of a search in one piece.
     Whole(Vec<Plan>),
 }
 
 impl Ongoing {
-    /// A search of so many iterations. If it may end sooner, the best plan counts, else the last of [`Solver::Gradient`].
+    /// A search of `iterations`. If it may end sooner, the result is the best plan; else, for [`Solver::Gradient`], the last.
     pub fn new(solver: Solver, iterations: usize, may_end_sooner: bool) -> Self {
         Self { solver, iterations, keep_best: may_end_sooner, state: State::New }
     }
@@ -36,7 +36,7 @@ impl Ongoing {
         self.solver
     }
 
-    /// True if all iterations were made.
+    /// True after all iterations.
     pub fn is_over(&self) -> bool {
         match &self.state {
             State::New => false,
@@ -46,7 +46,7 @@ impl Ongoing {
         }
     }
 
-    /// Number of rollouts so far, of all queries together: a search's time grows with it.
+    /// Number of rollouts so far over all queries, a measure of the search's time.
     pub fn rollouts(&self) -> usize {
         match &self.state {
             State::New => 0,
@@ -72,7 +72,7 @@ impl Ongoing {
         }
     }
 
-    /// The plans so far; none if the search has not begun.
+    /// The plans so far; empty if the search has not begun.
     pub fn into_plans(self) -> Vec<Plan> {
         match self.state {
             State::New => Vec::new(),

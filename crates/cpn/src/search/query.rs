@@ -1,15 +1,15 @@
-//! Queries for plans, the searches that answer them, and plans.
+//! Queries for plans, settings of their search, and plans.
 
-/// The ends of a plan: an observation's and a goal's embedding.
+/// Input of a search: embeddings of an observation and a goal, seed, and initial actions.
 #[derive(Debug, Clone, Copy)]
 pub struct Query<'a> {
     /// x, the observation's embedding, `[Z]`.
     pub x: &'a [f32],
     /// x_g, the goal's embedding, `[Z]`.
     pub x_g: &'a [f32],
-    /// Seed of everything random in the search.
+    /// Seed of the search's random numbers.
     pub seed: u64,
-    /// Actions to search from, `[H][A]`; the policy's if there are none.
+    /// Initial actions, `[H][A]`; the policy's if empty.
     pub start: &'a [Vec<f32>],
 }
 
@@ -17,19 +17,19 @@ pub struct Query<'a> {
 pub struct Search<'a> {
     /// The solver.
     pub solver: Solver,
-    /// The number of improvements.
+    /// The number of iterations.
     pub iterations: Iterations<'a>,
 }
 
-/// The end of a search.
+/// Number of a search's iterations.
 pub enum Iterations<'a> {
     /// A fixed number of iterations.
     Fixed(usize),
-    /// Iterations for as long as the answer is true.
+    /// Iterations until the function returns false.
     While(&'a mut dyn FnMut() -> bool),
 }
 
-/// Number of rollouts in a search of so many iterations: of [`Solver::Gradient`] forward and backward.
+/// Number of rollouts in a search of `iterations`; for [`Solver::Gradient`] each is forward and backward.
 pub fn rollouts(solver: Solver, iterations: usize) -> usize {
     match solver {
         Solver::Gradient => iterations + 1,
@@ -37,28 +37,30 @@ pub fn rollouts(solver: Solver, iterations: usize) -> usize {
     }
 }
 
-/// Solver: a search for the actions whose predicted end is nearest to the goal.
+/// Solver: minimisation of the inner loss over action sequences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Solver {
-    /// Updates by backpropagation through the predicted states (section "Universal planning networks").
+    /// Gradient descent by backpropagation through the predicted states (section "Universal planning networks").
     Gradient,
-    /// The cross-entropy method (Rubinstein, 1999): each generation of so many plans is drawn around the best of the last.
+    /// Cross-entropy method (Rubinstein, 1999), with the number of plans in a generation: the distribution is fitted to the elites
+    /// of each generation.
     Cem(usize),
-    /// Model predictive path integral control (Williams et al., 2017): around the mean of the last, weighted by loss.
+    /// Model predictive path integral control (Williams et al., 2017), with the number of plans in a generation: the mean is the
+    /// average of each generation, weighted by loss.
     Mppi(usize),
-    /// [`Solver::Cem`] whose mean takes a step down the gradient after each generation (Bharadhwaj et al., 2020).
+    /// [`Solver::Cem`] with a gradient step of the mean after each generation (Bharadhwaj et al., 2020).
     Hybrid(usize),
 }
 
-/// A planned action sequence with its predicted distance to the goal.
+/// A planned action sequence with its inner losses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// â_{t:t+H}, `[H][A]`; not clipped.
     pub actions: Vec<Vec<f32>>,
-    /// The inner loss before each iteration and after the last; where a search keeps the best plan, that of the best so far.
-    /// Empty for methods that do not plan.
+    /// Inner loss before each iteration and after the last; of the best plan so far where a search keeps it. Empty for methods
+    /// that do not plan.
     pub inner_losses: Vec<f32>,
-    /// Number of iterations after which this plan was found.
+    /// Number of iterations before this plan was found.
     pub iterations: usize,
 }
 
@@ -71,12 +73,12 @@ impl Iterations<'_> {
         }
     }
 
-    /// True if it is known that none follows `done`.
+    /// True if the number of iterations is fixed and reached by `done`.
     pub(crate) fn ends_at(&self, done: usize) -> bool {
         matches!(self, Self::Fixed(count) if done >= *count)
     }
 
-    /// True if the best plan counts, since it is not known which iteration is the last.
+    /// True if the result is the best plan rather than the last: the last iteration is not known in advance.
     pub(crate) fn keep_best(&self) -> bool {
         matches!(self, Self::While(_))
     }

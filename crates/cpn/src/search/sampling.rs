@@ -1,4 +1,4 @@
-//! Sampling-based searches: CEM, MPPI and CEM with a gradient step.
+//! Sampling-based searches: CEM, MPPI, and CEM with gradient steps.
 
 use super::block::{Actions, PlanBlock, Purpose};
 use super::query::{Plan, Query, Solver};
@@ -7,23 +7,23 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-/// Standard deviation of the first generation, of actions from -1 to 1; MPPI keeps it.
+/// Standard deviation of the first generation, for actions from -1 to 1; constant in MPPI.
 const INITIAL_STD: f32 = 0.5;
-/// Lower bound of CEM's standard deviation, so that it goes on exploring.
+/// Lower bound of CEM's standard deviation, so that exploration does not end.
 const MIN_STD: f32 = 0.05;
-/// Plans of a generation for each elite, one of the best that the next generation is drawn around.
+/// Ratio of a generation's plans to its elites.
 const PLANS_PER_ELITE: usize = 8;
 /// Temperature of MPPI, in standard deviations of the generation's losses.
 const TEMPERATURE: f32 = 0.1;
 
-/// A plan of actions `[H][A]` with its inner loss.
+/// A plan, `[H][A]`, with its inner loss.
 #[derive(Debug, Clone)]
 struct Candidate {
     actions: Vec<Vec<f32>>,
     loss: f32,
 }
 
-/// The normal distribution that the next generation is drawn from.
+/// Normal distribution of the next generation, independent for each action.
 #[derive(Debug)]
 struct ActionDistribution {
     /// `[H][A]`.
@@ -32,8 +32,8 @@ struct ActionDistribution {
     std: Vec<Vec<f32>>,
 }
 
-/// A search by generations, from the policy's actions or the query's own; the same for the same seed. It can be suspended after any
-/// piece of a generation and resumed.
+/// State of a sampling-based search, from the policy's actions or the query's start. Equal seeds give equal plans. It can be
+/// suspended after any piece of a generation and resumed.
 #[derive(Debug)]
 pub struct SamplingSearch {
     rng: ChaCha8Rng,
@@ -41,18 +41,18 @@ pub struct SamplingSearch {
     distribution: ActionDistribution,
     /// Inner loss of the best plan before each generation and after the last.
     inner_losses: Vec<f32>,
-    /// Number of generations after which the best plan was found.
+    /// Number of generations before the best plan was found.
     best_iteration: usize,
-    /// Number of whole generations.
+    /// Number of complete generations.
     pub done: usize,
-    /// The plans of the next generation that have been tried.
+    /// Evaluated plans of the current generation.
     generation: Vec<Candidate>,
     /// Number of rollouts so far.
     pub rollouts: usize,
 }
 
 impl SamplingSearch {
-    /// The first rollout, of the plan that the first generation is drawn around.
+    /// The first rollout: its plan is the mean of the first generation.
     pub fn begin(block: &mut impl PlanBlock, query: Query<'_>) -> Self {
         let source = if query.start.is_empty() { Actions::Proposed } else { Actions::Given };
         block.set_plan(1, 0, query.start);
@@ -71,22 +71,23 @@ impl SamplingSearch {
         }
     }
 
-    /// A piece of a generation: plans for each block and, with the last of a generation, its fit.
+    /// A piece of a generation: at most a block's capacity of plans for each block and, after the last piece, the fit.
     pub fn advance<B: PlanBlock>(&mut self, blocks: &mut [B], query: Query<'_>, solver: Solver) {
         let (Solver::Cem(count) | Solver::Mppi(count) | Solver::Hybrid(count)) = solver else { return };
-        let tried = self.generation.len();
-        let piece = (count - tried).min(blocks[0].capacity() * blocks.len());
+        let evaluated = self.generation.len();
+        let piece = (count - evaluated).min(blocks[0].capacity() * blocks.len());
         self.generation.extend(self.distribution.sample(piece, &mut self.rng));
-        evaluate(blocks, query, &mut self.generation[tried..]);
+        evaluate(blocks, query, &mut self.generation[evaluated..]);
         self.rollouts += piece;
         if self.generation.len() == count {
             self.fit(&mut blocks[0], query, solver);
         }
     }
 
-    /// The end of a generation: fits the distribution to it, and keeps the best plan.
+    /// Fits the distribution to a complete generation, and updates the best plan.
     fn fit(&mut self, block: &mut impl PlanBlock, query: Query<'_>, solver: Solver) {
         self.done += 1;
+
         let mut generation = std::mem::take(&mut self.generation);
         generation.sort_by(|a, b| a.loss.total_cmp(&b.loss));
         let mut best = generation[0].clone();
@@ -116,17 +117,17 @@ impl SamplingSearch {
         self.inner_losses.push(self.best.loss);
     }
 
-    /// The best plan of the generations that are whole.
+    /// The best plan of the complete generations.
     pub fn into_plan(self) -> Plan {
         Plan { actions: self.best.actions, inner_losses: self.inner_losses, iterations: self.best_iteration }
     }
 }
 
-/// The losses of candidates, at most a block's capacity for each block.
+/// Computes the losses of candidates, at most a block's capacity for each block.
 fn evaluate<B: PlanBlock>(blocks: &mut [B], query: Query<'_>, candidates: &mut [Candidate]) {
     let size = blocks[0].capacity();
     if candidates.len() <= size {
-        // Another thread would only have to be woken.
+        // One block suffices: waking another thread costs more than it saves.
         return evaluate_block(&mut blocks[0], query, candidates);
     }
     let parts = blocks.par_iter_mut().zip(candidates.par_chunks_mut(size));
@@ -212,14 +213,14 @@ mod tests {
         assert_eq!(fitted.std, [[0.5], [MIN_STD]]);
     }
 
-    /// Weights fall by e for each temperature, a tenth of the losses' standard deviation.
+    /// A weight falls by the factor e per temperature, which is a tenth of the losses' standard deviation.
     #[test]
     fn the_weighted_mean_follows_the_best() {
         let mean = weighted_mean(&[candidate([1.0, 0.0], 0.0), candidate([0.0, 1.0], 2.0)]);
         let worse = (-20.0f32).exp();
         assert!((mean[1][0] - worse / (1.0 + worse)).abs() < 1e-12, "{mean:?}");
         assert!((mean[0][0] - 1.0).abs() < 1e-6, "{mean:?}");
-        // Equal losses weigh the same.
+        // Equal losses have equal weights.
         let mean = weighted_mean(&[candidate([1.0, 0.0], 3.0), candidate([0.0, 0.5], 3.0)]);
         assert_eq!(mean, [[0.5], [0.25]]);
     }

@@ -1,4 +1,4 @@
-//! Searches over blocks of plans, at once or in pieces, on one thread or several.
+//! Searches over blocks of plans, in one or more pieces, on one or more threads.
 
 use super::block::PlanBlock;
 use super::descent::Descent;
@@ -7,13 +7,13 @@ use super::query::{Iterations, Plan, Query, Search, Solver};
 use super::sampling::SamplingSearch;
 use rayon::prelude::*;
 
-/// Searches for plans, with a block of plans for each thread.
+/// Runner of searches, with one block of plans per thread.
 #[derive(Debug)]
 pub struct Searcher<B> {
     blocks: Vec<B>,
 }
 
-/// A part of a batch: a block with its descent and the descent's queries.
+/// A thread's part of a batch: a block, its descent and the descent's queries.
 struct Share<'a, 'q, B> {
     block: &'a mut B,
     descent: &'a mut Descent,
@@ -21,22 +21,22 @@ struct Share<'a, 'q, B> {
 }
 
 impl<B: PlanBlock> Searcher<B> {
-    /// A searcher with one block or more, all of one model.
+    /// A searcher with one or more blocks of one model.
     pub fn new(blocks: Vec<B>) -> Self {
         Self { blocks }
     }
 
-    /// The blocks, one a thread.
+    /// The blocks, one per thread.
     pub fn blocks_mut(&mut self) -> &mut [B] {
         &mut self.blocks
     }
 
-    /// True if the method's plans can be searched for.
+    /// True if the method's plans have an inner loss, as [`PlanBlock::is_searchable`].
     pub fn is_searchable(&self) -> bool {
         self.blocks[0].is_searchable()
     }
 
-    /// Maximum number of queries that [`Self::resume`] takes together, for [`Solver::Gradient`].
+    /// Maximum batch size of [`Self::resume`] for [`Solver::Gradient`].
     pub fn together(&self) -> usize {
         self.blocks[0].capacity() * self.blocks.len()
     }
@@ -63,10 +63,10 @@ impl<B: PlanBlock> Searcher<B> {
     /// One or more pieces of a search, as [`Method::resume`](crate::Method::resume).
     pub fn resume(&mut self, queries: &[Query<'_>], ongoing: &mut Ongoing, go_on: &mut dyn FnMut() -> bool) {
         let (solver, count, keep_best) = (ongoing.solver, ongoing.iterations, ongoing.keep_best);
-        let is_whole = !self.is_searchable() || (solver == Solver::Gradient && queries.len() > self.together());
+        let in_one_piece = !self.is_searchable() || (solver == Solver::Gradient && queries.len() > self.together());
         let blocks = &mut self.blocks[..];
         match &mut ongoing.state {
-            State::New if is_whole => {
+            State::New if in_one_piece => {
                 let iterations = Iterations::Fixed(count);
                 ongoing.state = State::Whole(self.plan(queries, &mut Search { solver, iterations }));
             }
@@ -93,7 +93,7 @@ impl<B: PlanBlock> Searcher<B> {
                     })
                     .collect();
 
-                // One update of all shares is a piece.
+                // A piece is one update of all shares.
                 let is_over = |shares: &[Share<'_, '_, B>]| shares.iter().all(|share| share.descent.done >= count);
                 let update = |Share { block, descent, queries }: &mut Share<'_, '_, B>| {
                     let last = descent.done + 1 == count && !keep_best;
@@ -123,7 +123,7 @@ impl<B: PlanBlock> Searcher<B> {
     }
 }
 
-/// Plans by gradient descent down the inner loss, for at most a block's capacity of queries.
+/// Plans by gradient descent on the inner loss, for at most a block's capacity of queries.
 fn by_gradient<B: PlanBlock>(block: &mut B, queries: &[Query<'_>], iterations: &mut Iterations<'_>) -> Vec<Plan> {
     let mut descent = Descent::begin(block, queries);
     while block.is_searchable() && iterations.go_on(descent.done) {
@@ -133,7 +133,7 @@ fn by_gradient<B: PlanBlock>(block: &mut B, queries: &[Query<'_>], iterations: &
     descent.plans
 }
 
-/// A plan by sampling: all blocks try plans for the one query.
+/// A plan by a sampling-based search, with all blocks for one query.
 fn by_sampling<B: PlanBlock>(
     blocks: &mut [B],
     query: Query<'_>,
@@ -159,8 +159,8 @@ pub struct Chunks {
     pub size: usize,
 }
 
-/// Maps chunks of items in parallel, each thread with a multiple of `least` items but the last; returns the results in the order of
-/// the items.
+/// Maps chunks of items in parallel, and returns the results in the order of the items. Each thread but the last gets a multiple of
+/// `least` items.
 pub fn par_chunks<B: Send, I: Sync, O: Send>(
     blocks: &mut [B],
     items: &[I],
@@ -169,7 +169,7 @@ pub fn par_chunks<B: Send, I: Sync, O: Send>(
 ) -> Vec<O> {
     let share = items.len().div_ceil(blocks.len()).next_multiple_of(least);
     if share >= items.len() {
-        // Another thread would only have to be woken.
+        // One block suffices: waking another thread costs more than it saves.
         return items.chunks(size).flat_map(|items| run(&mut blocks[0], items)).collect();
     }
     let shares = blocks.par_iter_mut().zip(items.par_chunks(share));

@@ -1,6 +1,6 @@
-//! A valid message of every kind.
+//! A valid message of each type.
 
-use crate::survives;
+use crate::round_trip;
 use std::sync::LazyLock;
 use std::time::Duration;
 use wire::checkpoint::*;
@@ -11,7 +11,7 @@ use wire::sim::*;
 use wire::training::*;
 use wire::{Error, Image, Message, Position, encode};
 
-/// What checks a message of its kind, and the bytes of one.
+/// Check of a message type, and the bytes of a message.
 type Example = (fn(&[u8]) -> Result<(), Error>, Vec<u8>);
 
 pub static EXAMPLES: LazyLock<Vec<Example>> = LazyLock::new(|| {
@@ -19,7 +19,7 @@ pub static EXAMPLES: LazyLock<Vec<Example>> = LazyLock::new(|| {
 });
 
 fn example<M: Message>(message: M) -> Example {
-    (survives::<M>, encode(message))
+    (round_trip::<M>, encode(message))
 }
 
 fn planner() -> Vec<Example> {

@@ -1,4 +1,4 @@
-//! Messages: no bytes make a decoder panic, and what decodes is encoded to bytes that decode to the same again.
+//! Messages: no input makes a decoder panic, and decoded messages round-trip.
 
 #![no_main]
 
@@ -8,7 +8,7 @@ use examples::EXAMPLES;
 use libfuzzer_sys::fuzz_target;
 use wire::{Error, Message, decode, encode};
 
-/// Longest error, in bytes; it travels in a header of gRPC.
+/// Maximum length of an error, in bytes; it is sent in a gRPC header.
 const MAX_ERROR_BYTES: usize = 1200;
 
 fuzz_target!(init: fuzz::seed("messages", inputs(), check), |input: &[u8]| {
@@ -17,19 +17,19 @@ fuzz_target!(init: fuzz::seed("messages", inputs(), check), |input: &[u8]| {
     }
 });
 
-/// Decodes all but the first byte, as the message that this stands for.
+/// Checks an input: the first byte selects the message type of the rest.
 fn check(input: &[u8]) -> Result<(), Error> {
     let Some((&number, bytes)) = input.split_first() else { return Ok(()) };
-    let (survives, _) = &EXAMPLES[usize::from(number) % EXAMPLES.len()];
-    survives(bytes)
+    let (round_trip, _) = &EXAMPLES[usize::from(number) % EXAMPLES.len()];
+    round_trip(bytes)
 }
 
 fn inputs() -> Vec<Vec<u8>> {
     (0..).zip(EXAMPLES.iter()).map(|(number, (_, bytes))| [&[number][..], bytes].concat()).collect()
 }
 
-/// Compares bytes, since some messages may hold what is not a number.
-fn survives<M: Message>(bytes: &[u8]) -> Result<(), Error> {
+/// Checks a round trip. Bytes are compared, since messages may contain NaN.
+fn round_trip<M: Message>(bytes: &[u8]) -> Result<(), Error> {
     let copy = encode(decode::<M>(bytes)?);
     let same = decode::<M>(&copy).expect("what was encoded can be decoded");
     assert_eq!(encode(same), copy);

@@ -1,4 +1,4 @@
-//! What a training run can be told.
+//! Settings of a training run.
 
 use anyhow::{Context, ensure};
 use cpn::{ModelConfig, Preset, Recipe, Training};
@@ -11,13 +11,13 @@ use service_kit::config;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// How the names of environment variables begin.
+/// Prefix of environment variables.
 const PREFIX: &str = "CPN_TRAIN_";
-/// Settings that are text, whatever they look like.
+/// Settings with values of text, even if they look like numbers.
 const TEXTS: [&str; 6] = ["preset", "dataset", "out", "run_dir", "engine", "device"];
-/// Most threads of a run: more than any machine has to gain from.
+/// Maximum number of threads: more than any machine can use.
 const MAX_THREADS: usize = 1024;
-/// Settings of a run, by their names.
+/// Names of the settings.
 const FIELDS: [&str; 12] = [
     "preset",
     "model",
@@ -37,30 +37,30 @@ const FIELDS: [&str; 12] = [
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Where model and training come from, as far as nothing else is said of them.
+    /// Preset, with the default of model and training.
     pub preset: Preset,
-    /// What is trained.
+    /// Model configuration.
     pub model: ModelConfig,
-    /// How.
+    /// Training settings.
     pub training: Training,
     /// Folder of the demonstrations.
     pub dataset: PathBuf,
-    /// Where the checkpoint goes.
+    /// File of the checkpoint.
     pub out: PathBuf,
-    /// Tasks that the model must not see.
+    /// Tasks held out of the training.
     pub hold_out: Vec<String>,
     /// Seed of initialisation and sampling.
     pub seed: u64,
-    /// Engine that computes; none for the device's own: native on the CPU, torch on a CUDA device.
+    /// Engine; by default native on the CPU, and torch on a CUDA device.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub engine: Option<EngineKind>,
-    /// Device that computes.
+    /// Device.
     pub device: Device,
-    /// Number of threads that compute on the CPU. The order of sums depends on their number, and with it the last bits of the weights.
+    /// Number of threads on the CPU. It determines the order of sums, and with it the last bits of the weights.
     pub threads: usize,
-    /// How often the run saves its state; 0 is after each step.
+    /// Interval between saved states, in seconds; 0 saves after each step.
     pub save_interval_seconds: f64,
-    /// Where the run keeps its progress, events and curve; `runs/training/` and the stem of `out` if none is given.
+    /// Folder of progress, events and curve; by default `runs/training/` and the stem of `out`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub run_dir: Option<PathBuf>,
 }
@@ -85,24 +85,23 @@ impl From<Preset> for Config {
     }
 }
 
-/// The value of a setting that is written as text. What lies below `model` and `training` says its type itself, since it may
-/// be of one kind or another; the others are told by their names.
+/// Parses the value of a setting. Settings of text are recognised by name; the values of all others are TOML, or else text.
 fn value(key: &str, text: &str) -> Value {
     if TEXTS.contains(&key) {
         return Value::from(text);
     }
-    // Figment's own reading of text knows neither exponents nor that a decimal fraction needs 64 bits.
+    // Figment's own parser lacks exponents, and reads decimal fractions with 32 bits.
     let value =
         toml::from_str::<toml::Table>(&format!("value = {text}")).ok().and_then(|mut table| table.remove("value"));
     value.and_then(|value| Value::serialize(value).ok()).unwrap_or_else(|| Value::from(text))
 }
 
 impl Config {
-    /// Reads settings in layers: `changes`, each `key=value`, over what was typed over the environment over a file over the
-    /// preset, which any of them may name.
+    /// Reads settings in layers of increasing precedence: preset, file, environment, command-line arguments, and `changes`, each
+    /// `key=value`. Any layer may name the preset.
     ///
     /// # Errors
-    /// Names the field, what was expected and what came.
+    /// The invalid field, with the expected and the given value.
     pub fn load(file: Option<&Path>, arguments: &impl Serialize, changes: &[String]) -> anyhow::Result<Self> {
         let mut layers = Figment::new();
         if let Some(file) = file {
@@ -119,15 +118,15 @@ impl Config {
         Self::over_preset(layers)
     }
 
-    /// Reads settings as they stand in a file.
+    /// Reads settings from TOML.
     ///
     /// # Errors
-    /// Names the field, what was expected and what came.
+    /// The invalid field, with the expected and the given value.
     pub fn from_toml(text: &str) -> anyhow::Result<Self> {
         Self::over_preset(Figment::from(Toml::string(text)))
     }
 
-    /// The settings of the preset that some settings name, and these over them.
+    /// Settings over those of the preset that they name.
     fn over_preset(settings: Figment) -> anyhow::Result<Self> {
         let preset = if settings.contains("preset") { settings.extract_inner("preset")? } else { Preset::Cpn };
         let config: Self = Figment::from(Serialized::defaults(Self::from(preset))).merge(settings).extract()?;
@@ -135,10 +134,10 @@ impl Config {
         Ok(config)
     }
 
-    /// Checks what can be checked before anything is read.
+    /// Checks the settings, without access to files.
     ///
     /// # Errors
-    /// Names the field, what was expected and what came.
+    /// The invalid field, with the expected and the given value.
     pub fn validate(&self) -> anyhow::Result<()> {
         self.recipe().validate()?;
         let threads = self.threads;
@@ -153,6 +152,7 @@ impl Config {
             "out: expected the path of a file, got {:?}",
             self.out.display().to_string()
         );
+
         for (index, task) in self.hold_out.iter().enumerate() {
             let known = self.hold_out[..index].contains(task);
             ensure!(!task.is_empty() && !known, "hold_out: expected tasks, each once, got {:?}", self.hold_out);
@@ -160,17 +160,17 @@ impl Config {
         Ok(())
     }
 
-    /// The run's name: the stem of its checkpoint's file.
+    /// Name of the run: the stem of its checkpoint's file.
     pub fn name(&self) -> String {
         self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// Where the run keeps its progress, events and curve.
+    /// Folder of progress, events and curve.
     pub fn run_dir(&self) -> PathBuf {
         self.run_dir.clone().unwrap_or_else(|| Path::new("runs/training").join(self.name()))
     }
 
-    /// What is trained, and how.
+    /// Configuration of the model and its training.
     pub fn recipe(&self) -> Recipe {
         Recipe { model: self.model.clone(), training: self.training.clone() }
     }

@@ -1,4 +1,4 @@
-//! The learning curve of a run as a picture.
+//! Plot of a run's learning curve.
 
 use crate::training::journal::Entry;
 use crate::training::progress::Progress;
@@ -6,19 +6,19 @@ use anyhow::anyhow;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-/// Width and height of the picture, in pixels.
+/// Width and height of the plot, in pixels.
 const SIZE: (u32, u32) = (960, 840);
-/// Height of the panel of the loss, in pixels: the loss is what one looks at.
+/// Height of the loss's panel, in pixels, larger than the others.
 const LOSS_HEIGHT: i32 = 400;
 const TEXT: RGBColor = RGBColor(60, 64, 72);
 const GRID: RGBColor = RGBColor(228, 230, 234);
 const FONT: &str = "sans-serif";
 
-/// One quantity against the step.
+/// Plot of one quantity against the step.
 struct Panel {
     caption: &'static str,
     color: RGBColor,
-    /// Most numbers at its axis.
+    /// Maximum number of labels at the vertical axis.
     labels: usize,
     value: fn(&Progress) -> f64,
 }
@@ -39,10 +39,10 @@ const PANELS: [Panel; 3] = [
     },
 ];
 
-/// Loss, learning rate and speed against the step, as an SVG document.
+/// Plots loss, learning rate and throughput against the step, as an SVG document.
 ///
 /// # Errors
-/// If it cannot be drawn.
+/// If the plot cannot be drawn.
 pub(crate) fn draw(name: &str, entries: &[Entry]) -> anyhow::Result<String> {
     let mut svg = String::new();
     {
@@ -78,6 +78,7 @@ fn draw_panel<B: DrawingBackend>(
     let points = entries.iter().map(|entry| (entry.progress.step as f64, (panel.value)(&entry.progress)));
     let steps = entries.last().map_or(1.0, |entry| entry.progress.steps as f64);
     let highest = points.clone().map(|(_, value)| value).fold(f64::MIN_POSITIVE, f64::max);
+
     let mut chart = ChartBuilder::on(area)
         .margin(10)
         .margin_right(28)
@@ -100,7 +101,7 @@ fn draw_panel<B: DrawingBackend>(
     Ok(())
 }
 
-/// A number of an axis, short.
+/// Label of a value at an axis.
 fn label(value: &f64) -> String {
     match value.abs() {
         0.0 => "0".into(),

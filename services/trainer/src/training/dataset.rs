@@ -1,4 +1,4 @@
-//! The demonstrations of a training run, in memory: every frame as bytes or as a position, side by side.
+//! Dataset of a training run: all demonstrations in memory.
 
 use crate::record::folder::{self, dataset_digest};
 use crate::record::frame;
@@ -11,12 +11,13 @@ use std::path::{Path, PathBuf};
 use wire::Error;
 use wire::demonstration::RecordedEpisode;
 
-/// Every frame and action of every episode that is not held out.
+/// Frames and actions of all episodes that are not held out.
 #[derive(Debug)]
 pub struct Dataset {
-    /// Episode after episode; of positions the last of each is where the hand was to go, which is only ever a goal.
+    /// Frames in the order of the episodes. With positions, an episode's last frame is the recorded goal position, which is used
+    /// only as a goal.
     frames: Frames,
-    /// `[actions, A]`, episode after episode.
+    /// Actions in the order of the episodes, `[actions, A]`.
     actions: Vec<f32>,
     action_size: usize,
     episodes: Vec<Episode>,
@@ -24,24 +25,23 @@ pub struct Dataset {
     digest: String,
 }
 
-/// Where an episode lies: T actions, and T + 1 frames before, between and after them.
+/// Location of an episode in the dataset: T actions, and T + 1 frames before, between and after them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Episode {
-    /// Its first frame among all.
+    /// Index of the first frame in the dataset.
     pub first_frame: usize,
-    /// Its first action among all.
+    /// Index of the first action in the dataset.
     pub first_action: usize,
-    /// T.
+    /// T, the number of actions.
     pub action_count: usize,
 }
 
 impl Dataset {
-    /// Reads every episode of `folder` but those of the `held_out` tasks, as images or as positions.
+    /// Reads all episodes of `folder`, except those of the `held_out` tasks, as images or as positions.
     ///
     /// # Errors
-    /// If a recording is damaged or has no positions where these are asked for, two have one id, the episodes differ in the
-    /// size of their actions or in how they were rendered, none is left, or a held-out task has none, which is more likely a slip of the
-    /// pen than meant.
+    /// If a recording is damaged, or has no positions for an input of positions; two recordings have the same id; episodes differ
+    /// in action size or render spec; no episode is left; or a held-out task has no episode, which is probably a misspelling.
     pub fn load(folder: &Path, held_out: &[String], input: Input) -> anyhow::Result<Self> {
         let all_tasks = folder::tasks(folder)?;
         for task in held_out {
@@ -54,7 +54,8 @@ impl Dataset {
         if let Some(duplicate) = folder::duplicates(&paths).into_iter().next() {
             bail!(duplicate);
         }
-        // The headers tell how much room everything takes; then each core fills in episodes.
+
+        // Memory is allocated by the headers' sizes; then the episodes are read into it in parallel.
         let infos = paths.par_iter().map(|path| header(path)).collect::<anyhow::Result<Vec<_>>>()?;
         let (mut episodes, mut count) = (Vec::with_capacity(infos.len()), 0);
         for (path, info) in paths.iter().zip(&infos) {
@@ -68,6 +69,7 @@ impl Dataset {
             episodes.push(Episode { first_frame: count, first_action: count - episodes.len(), action_count });
             count += action_count + 1;
         }
+
         let (frames, read) = match input {
             Input::Image => {
                 let mut pixels = vec![0; count * images::BYTES];
@@ -80,6 +82,7 @@ impl Dataset {
                 (Frames::Positions(positions), read)
             }
         };
+
         let action_size = read[0].1;
         for ((_, got), path) in read.iter().zip(&paths) {
             let path = path.display();
@@ -93,12 +96,12 @@ impl Dataset {
         Ok(Self { frames, actions, action_size, episodes, infos, digest })
     }
 
-    /// Names of the tasks, in order.
+    /// Names of the tasks, sorted.
     pub fn tasks(&self) -> BTreeSet<&str> {
         self.infos.iter().map(|info| info.variation.task.as_str()).collect()
     }
 
-    /// How every frame was rendered; empty for those of a real camera and for positions.
+    /// Render spec of the frames; empty for images of a real camera and for positions.
     pub fn render_spec(&self) -> &str {
         match self.frames {
             Frames::Images(_) => &self.infos[0].render_spec,
@@ -121,17 +124,17 @@ impl Dataset {
         self.action_size
     }
 
-    /// What [`dataset_digest`] gives for the episodes.
+    /// Digest of the episodes, by [`dataset_digest`].
     pub fn digest(&self) -> &str {
         &self.digest
     }
 
-    /// What was observed.
+    /// Frames of all episodes.
     pub fn frames(&self) -> &Frames {
         &self.frames
     }
 
-    /// The actions `[count, A]` from one on.
+    /// The `count` actions, `[count, A]`, from index `first` on.
     pub fn actions(&self, first: usize, count: usize) -> &[f32] {
         &self.actions[first * self.action_size..][..count * self.action_size]
     }
@@ -143,7 +146,7 @@ fn header(path: &Path) -> anyhow::Result<RecordedEpisode> {
     Ok(info)
 }
 
-/// Cuts the frames, `size` values each, into those of each episode.
+/// Divides the frames, of `size` values each, into one slice per episode.
 fn slots<'a, T>(mut frames: &'a mut [T], size: usize, episodes: &[Episode]) -> Vec<&'a mut [T]> {
     let cut = |episode: &Episode| {
         let (slot, rest) = std::mem::take(&mut frames).split_at_mut((episode.action_count + 1) * size);
@@ -153,7 +156,7 @@ fn slots<'a, T>(mut frames: &'a mut [T], size: usize, episodes: &[Episode]) -> V
     episodes.iter().map(cut).collect()
 }
 
-/// Lets `copy` put each episode's frames into its slot; answers its actions `[T, A]` and A.
+/// Reads the episodes and copies their frames into their slots by `copy`; returns actions, `[T, A]`, and A of each.
 fn fill<T: Send>(
     slots: Vec<&mut [T]>,
     folder: &Path,
@@ -172,9 +175,9 @@ fn fill<T: Send>(
 
 fn copy_pixels(episode: &Recording, slot: &mut [u8]) -> anyhow::Result<()> {
     check_count(slot.len() / images::BYTES, episode)?;
-    for (place, step) in slot.chunks_exact_mut(images::BYTES).zip(episode.steps()) {
+    for (image, step) in slot.chunks_exact_mut(images::BYTES).zip(episode.steps()) {
         frame::check(step)?;
-        place.copy_from_slice(step.frame.data());
+        image.copy_from_slice(step.frame.data());
     }
     Ok(())
 }
@@ -184,8 +187,8 @@ fn copy_positions(episode: &Recording, slot: &mut [[f32; 3]]) -> anyhow::Result<
     let position = |values: &[f32], field: String, expected| {
         values.first_chunk().copied().ok_or_else(|| Error::invalid(field, expected, values.len()))
     };
-    for (place, step) in slot.iter_mut().zip(episode.steps()) {
-        *place = position(&step.state, format!("steps[{}].state", step.step), "at least 3 values")?;
+    for (target, step) in slot.iter_mut().zip(episode.steps()) {
+        *target = position(&step.state, format!("steps[{}].state", step.step), "at least 3 values")?;
     }
     let goal = position(&episode.info().goal_position, "goal_position".into(), "3 values")?;
     slot[slot.len() - 1] = goal;

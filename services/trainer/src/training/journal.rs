@@ -1,4 +1,4 @@
-//! What a run leaves in its folder: `progress.jsonl`, a TensorBoard event file with the same values, and `curve.svg`.
+//! Journal of a run in its folder: `progress.jsonl`, a TensorBoard event file with the same values, and `curve.svg`.
 
 use crate::training::curve;
 use crate::training::progress::{Observer, Progress, ends_epoch};
@@ -14,54 +14,54 @@ use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Most steps of a run that are noted, besides the last of each epoch.
+/// Maximum number of noted steps, besides the last of each epoch.
 const MAX_NOTED: u64 = 1000;
-/// Name of the file with a line for each noted step.
+/// Name of the file with one line per noted step.
 const PROGRESS: &str = "progress.jsonl";
-/// How the names of TensorBoard's files begin.
+/// Prefix of TensorBoard's file names.
 const EVENTS: &str = "events.out.tfevents.";
-/// Name of the file that says whose folder it is: the path of the run's checkpoint.
+/// Name of the file with the path of the run's checkpoint, which marks the owner of the folder.
 const OWNER: &str = "checkpoint.txt";
 
 /// A line of `progress.jsonl`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Entry {
-    /// When the step was done.
+    /// Time of the step's end, in seconds since the Unix epoch.
     pub unix_seconds: f64,
-    /// How far the run was then.
+    /// Progress after the step.
     #[serde(flatten)]
     pub progress: Progress,
 }
 
-/// Notes the progress of a run in its folder. The lines are the record; events and curve are made of them.
+/// Observer that notes a run's progress in its folder. Events and curve are derived from the lines of `progress.jsonl`.
 #[derive(Debug)]
 pub struct Journal {
     folder: PathBuf,
     name: String,
-    /// Held as long as this lives: two processes would each note a part.
+    /// Lock of the folder, so that two processes do not note different parts.
     _lock: File,
     entries: Vec<Entry>,
-    open: Option<Open>,
+    files: Option<OpenFiles>,
 }
 
-/// The files that grow.
+/// Files that are appended to.
 #[derive(Debug)]
-struct Open {
+struct OpenFiles {
     lines: File,
     events: EventWriter<File>,
 }
 
 impl Journal {
-    /// The journal in a folder, of the run that writes this checkpoint.
+    /// Opens the journal in a folder, for the run that writes `checkpoint`.
     ///
     /// # Errors
-    /// If the folder cannot be made, another process has it, or it is that of a run whose checkpoint is another file.
+    /// If the folder cannot be created, is locked by another process, or is owned by a run with another checkpoint.
     pub fn open(folder: PathBuf, checkpoint: &Path) -> anyhow::Result<Self> {
         let lock = files::take_over(&folder).context("run_dir")?;
         files::remove_unfinished(&folder)?;
         own(&folder, &std::path::absolute(checkpoint)?)?;
         let name = checkpoint.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Self { folder, name, _lock: lock, entries: Vec::new(), open: None })
+        Ok(Self { folder, name, _lock: lock, entries: Vec::new(), files: None })
     }
 
     fn draw(&self) -> anyhow::Result<()> {
@@ -70,7 +70,7 @@ impl Journal {
 }
 
 impl Observer for Journal {
-    /// Drops what was noted of steps that will be done again.
+    /// Drops the entries of steps that will be repeated.
     fn begin(&mut self, step: u64) -> anyhow::Result<()> {
         self.entries = read(&self.folder)?;
         self.entries.retain(|entry| entry.progress.step <= step);
@@ -78,7 +78,7 @@ impl Observer for Journal {
         let lines = self.entries.iter().map(line).collect::<serde_json::Result<Vec<_>>>()?;
         files::write_atomically(&path, &lines.concat())?;
         let lines = OpenOptions::new().append(true).open(&path).with_context(|| path.display().to_string())?;
-        self.open = Some(Open { lines, events: begin_events(&self.folder, &self.entries)? });
+        self.files = Some(OpenFiles { lines, events: begin_events(&self.folder, &self.entries)? });
         Ok(())
     }
 
@@ -88,16 +88,16 @@ impl Observer for Journal {
             return Ok(());
         }
         let entry = Entry { unix_seconds: unix_seconds(), progress: *progress };
-        let open = self.open.as_mut().context("a journal that has begun")?;
-        open.lines.write_all(&line(&entry)?).with_context(|| self.folder.join(PROGRESS).display().to_string())?;
-        write_events(&mut open.events, &entry)?;
+        let files = self.files.as_mut().context("a journal that has begun")?;
+        files.lines.write_all(&line(&entry)?).with_context(|| self.folder.join(PROGRESS).display().to_string())?;
+        write_events(&mut files.events, &entry)?;
         self.entries.push(entry);
         if ends_epoch(progress) { self.draw() } else { Ok(()) }
     }
 }
 
-/// Says whose folder it is, unless it is that of another run, whose curve would be lost. A run of which nothing is left but
-/// the curve, or whose folders were moved, gives way.
+/// Marks the run as owner of the folder. A folder of another run is refused, so that its curve is not overwritten, unless neither
+/// the checkpoint nor the saved state of that run exists at its path any more.
 fn own(folder: &Path, checkpoint: &Path) -> anyhow::Result<()> {
     let path = folder.join(OWNER);
     let owner = match std::fs::read(&path) {
@@ -117,10 +117,10 @@ fn own(folder: &Path, checkpoint: &Path) -> anyhow::Result<()> {
     files::write_atomically(&path, checkpoint.as_os_str().as_bytes())
 }
 
-/// What is noted in a folder; a line that was cut by a crash, and what follows it, is not.
+/// Reads the entries of a folder, up to the first line that is malformed, as after a crash; none if the file does not exist.
 ///
 /// # Errors
-/// If the file is there and cannot be read.
+/// If the file exists and cannot be read.
 pub fn read(folder: &Path) -> anyhow::Result<Vec<Entry>> {
     let path = folder.join(PROGRESS);
     match std::fs::read_to_string(&path) {
@@ -139,11 +139,11 @@ fn line(entry: &Entry) -> serde_json::Result<Vec<u8>> {
     Ok(line)
 }
 
-/// A new event file with what is known, in place of the old ones.
+/// Creates an event file with the entries, and removes the previous ones.
 fn begin_events(folder: &Path, entries: &[Entry]) -> anyhow::Result<EventWriter<File>> {
     let mut old = files::list(folder)?;
     old.retain(|path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(EVENTS)));
-    // The name grows, so that a TensorBoard that is open goes on to this file.
+    // Names increase, so that a running TensorBoard continues with the new file.
     let path = folder.join(format!("{EVENTS}{:.6}.{}", unix_seconds(), std::process::id()));
     let mut events = EventWriter::new(File::create_new(&path)?, unix_seconds())?;
     for entry in entries {

@@ -1,8 +1,8 @@
-//! Training of a model: one process, from recordings to a checkpoint.
+//! Training of a model in one process, from recordings to a checkpoint.
 //!
-//! A run ([`run`]) with its settings ([`config`]) reads the episodes ([`dataset`]), draws samples of them ([`sampler`],
-//! [`augment`]) for the [`Learner`](cpn::Learner) of its engine, reports its [`progress`], keeps a [`journal`] with TensorBoard events
-//! ([`tensorboard`]) and a learning curve, and writes a checkpoint.
+//! A run ([`run`]) with its settings ([`config`]) reads the episodes ([`dataset`]), draws batches ([`sampler`], [`augment`]) for
+//! the [`Learner`](cpn::Learner) of its engine, reports its [`progress`], writes a [`journal`] with TensorBoard events
+//! ([`tensorboard`]) and a learning curve, and at the end a checkpoint.
 
 pub mod allocator;
 pub mod augment;

@@ -1,4 +1,4 @@
-//! How far a training run is, and who is told.
+//! Progress of a training run, and its observers.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
@@ -7,36 +7,36 @@ use std::time::{Duration, Instant};
 use tracing::info;
 pub use wire::training::Progress;
 
-/// How much of the running mean of the loss a step takes over.
+/// Weight of a step in the running mean of the loss.
 const LOSS_WEIGHT: f64 = 0.02;
-/// Least time between two lines of JSON.
+/// Minimum time between two lines of JSON.
 const LINE_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Watches a run, and may end it.
+/// Observer of a run, which may interrupt it.
 pub trait Observer {
-    /// Hears that the run begins, or goes on, after so many steps.
+    /// Called at the start of a run, or at its resumption after `step` steps.
     ///
     /// # Errors
-    /// If what was noted before cannot be taken up.
+    /// If notes of previous steps cannot be continued.
     fn begin(&mut self, _step: u64) -> anyhow::Result<()> {
         Ok(())
     }
 
-    /// Whether the run shall save its state and end; asked before each step with the number of steps done.
+    /// True if the run shall save its state and end; called before each step with the number of completed steps.
     fn should_stop(&self, _step: u64) -> bool {
         false
     }
 
-    /// Hears of each step.
+    /// Called after each step.
     ///
     /// # Errors
-    /// If it cannot be noted.
+    /// If the progress cannot be noted.
     fn observe(&mut self, _progress: &Progress) -> anyhow::Result<()> {
         Ok(())
     }
 }
 
-/// Several observers as one: each hears everything, and any may end the run.
+/// Several observers as one: all are called, and any may interrupt the run.
 impl Observer for Vec<Box<dyn Observer>> {
     fn begin(&mut self, step: u64) -> anyhow::Result<()> {
         self.iter_mut().try_for_each(|observer| observer.begin(step))
@@ -51,7 +51,7 @@ impl Observer for Vec<Box<dyn Observer>> {
     }
 }
 
-/// Ends a run as soon as the function, given the number of steps done, says so.
+/// Observer that interrupts a run when the function, of the number of completed steps, returns true.
 #[derive(Debug)]
 pub struct StopIf<F>(pub F);
 
@@ -61,12 +61,12 @@ impl<F: Fn(u64) -> bool> Observer for StopIf<F> {
     }
 }
 
-/// A bar on a terminal, a line for each epoch in the log.
+/// Progress bar on a terminal, and a line in the log for each epoch.
 #[derive(Debug)]
 pub struct Bar(ProgressBar);
 
 impl Bar {
-    /// A bar of a run of this name.
+    /// A bar of a run, by its name.
     pub fn new(name: &str) -> Self {
         let style = "{prefix:>5} {wide_bar} {pos}/{len} steps, {msg}, {eta} left";
         let style = ProgressStyle::with_template(style).expect("a valid template");
@@ -94,7 +94,7 @@ impl Observer for Bar {
     }
 }
 
-/// Progress as lines of JSON on standard output, a few each second. When they cannot be written any more, the run ends.
+/// Progress as lines of JSON on standard output, at most ten a second. If they cannot be written, the run is interrupted.
 #[derive(Debug, Default)]
 pub struct JsonLines {
     printed: Option<Instant>,
@@ -119,7 +119,7 @@ impl Observer for JsonLines {
 /// Prints a value as one line of JSON.
 ///
 /// # Errors
-/// If nobody reads it.
+/// If standard output cannot be written.
 pub fn print_line(value: &impl Serialize) -> std::io::Result<()> {
     let mut line = serde_json::to_vec(value)?;
     line.push(b'\n');
@@ -128,23 +128,23 @@ pub fn print_line(value: &impl Serialize) -> std::io::Result<()> {
     out.flush()
 }
 
-/// Whether the step was the last of an epoch.
+/// True after the last step of an epoch.
 pub(crate) fn ends_epoch(progress: &Progress) -> bool {
     (progress.step * progress.epochs).is_multiple_of(progress.steps)
 }
 
-/// Turns what is known of single steps into the progress of a run.
+/// Computes the progress of a run from its steps.
 #[derive(Debug)]
 pub(crate) struct Meter {
-    /// Steps of the whole run.
+    /// Number of steps of the whole run.
     steps: u64,
-    /// Passes of the whole run.
+    /// Number of epochs of the whole run.
     epochs: u64,
-    /// Samples that were trained on.
+    /// Number of samples so far.
     samples: u64,
-    /// Running mean of the outer loss; none before the first step.
+    /// Running mean of the outer loss; `None` before the first step.
     pub(crate) loss: Option<f64>,
-    /// When this process began, and how many samples there were then.
+    /// Start of this process, and the number of samples at that time.
     began: (Instant, u64),
 }
 
@@ -153,7 +153,7 @@ impl Meter {
         Self { steps, epochs, samples, loss, began: (Instant::now(), samples) }
     }
 
-    /// The progress with one more step on so many samples, after which `step` are done.
+    /// Progress after a step on `samples` samples; `step` is the number of completed steps.
     pub(crate) fn step(&mut self, step: u64, samples: usize, loss: f64, learning_rate: f64, norm: f64) -> Progress {
         let Self { steps, epochs, began: (instant, before), .. } = *self;
         self.samples += samples as u64;

@@ -1,4 +1,4 @@
-//! A training run: the outer loop over all demonstrations, with progress, interruption and resumption.
+//! Training run: training over all epochs, with progress, interruption and resumption.
 
 use crate::training::config::Config;
 use crate::training::dataset::Dataset;
@@ -17,54 +17,57 @@ use std::thread;
 use std::time::{Duration, Instant};
 use tracing::info;
 
-/// How the name of a run's saved state ends.
+/// File name extension of a run's saved state.
 pub(crate) const RESUME: &str = "resume";
 
-/// How a run ended.
+/// Outcome of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The checkpoint of this digest is written.
+    /// The checkpoint is written.
     Finished {
-        /// SHA-256, in hex.
+        /// SHA-256 of the checkpoint, in hex.
         digest: String,
     },
-    /// Stopped after so many steps; the same run goes on from there.
+    /// The run was interrupted, and can be resumed.
     Interrupted {
-        /// Steps done.
+        /// Number of completed steps.
         step: u64,
     },
 }
 
-/// What a saved state belongs to.
+/// Identity of a saved state: it is resumed only by a run with the same recipe, seed and data.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ResumePoint {
     recipe: Recipe,
     seed: u64,
     data_digest: String,
-    /// Steps done.
+    /// Number of completed steps.
     step: u64,
-    /// Running mean of the loss, for those who watch.
+    /// Running mean of the loss, for the progress.
     loss: Option<f64>,
 }
 
-/// Trains until the checkpoint is written or `observer` stops it; from a saved state if there is one.
+/// Trains until the checkpoint is written or `observer` interrupts the run, from a saved state if it exists.
 ///
 /// # Errors
-/// If the settings are out of range or do not fit the demonstrations, these cannot be read, another process writes the
-/// checkpoint, the saved state belongs to another run, the loss is no longer finite, a file cannot be written, or the observer fails.
+/// If the settings are out of range or do not fit the demonstrations, these cannot be read, another process writes the checkpoint,
+/// the saved state belongs to another run, the loss is not finite, a file cannot be written, or the observer fails.
 pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outcome> {
     config.validate()?;
     ensure!(!config.out.is_dir(), "out: expected the path of a file, got that of a folder, {}", config.out.display());
     let recipe = config.recipe();
     let Recipe { model, training } = &recipe;
+
     let engine = engines::build(config.engine, config.device, config.threads)?;
     let save_interval = Duration::try_from_secs_f64(config.save_interval_seconds).context("save_interval_seconds")?;
     let dataset = Dataset::load(&config.dataset, &config.hold_out, model.encoder.input())?;
+
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
     let _keeper = files::take_over_file(&config.out).context("out")?;
+
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();
     if training.precision.where_faster() != training.precision {
         info!("training.precision: the processor has no instructions for bfloat16 (AVX512-BF16); training in float32");
@@ -81,13 +84,14 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     let mut meter = Meter::new(total, training.epochs.into(), sampler.samples_before(start), loss);
     let mut saved = Instant::now();
     let interrupted = thread::scope(|scope| {
-        // Batches are made while the last one is computed with.
+        // The next batch is prepared during a step.
         let (sender, batches) = mpsc::sync_channel(1);
         scope.spawn(move || {
             let mut batches = sampler.batches(start).take((total - start) as usize);
-            // The run may end before its batches do.
+            // Sending fails once the run is interrupted.
             let _ = batches.try_for_each(|batch| sender.send(batch));
         });
+
         for (step, batch) in (start..total).zip(batches) {
             if observer.should_stop(step) {
                 state.save(step, &*learner, &meter)?;
@@ -121,7 +125,8 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     Ok(Outcome::Finished { digest: checkpoint::digest(&bytes) })
 }
 
-/// The learning rate of a step: up over the first 30 % of the run, then down, both along a cosine (Smith, 2018).
+/// The learning rate of a step by the one-cycle schedule (Smith, 2018): from peak / 25 to the peak over the first 30 % of the run,
+/// then to 0, both along a cosine.
 fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
     const WARM_UP: f64 = 0.3;
     let done = step as f64 / total as f64;
@@ -130,7 +135,7 @@ fn one_cycle(step: u64, total: u64, peak: f64) -> f64 {
     low + (peak - low) * 0.5 * (1.0 + (PI * progress).cos())
 }
 
-/// A run's state, on disk beside its checkpoint.
+/// Saved state of a run, beside its checkpoint.
 struct Saved<'a> {
     path: PathBuf,
     config: &'a Config,
@@ -147,12 +152,12 @@ impl Saved<'_> {
         files::write_atomically(&self.path, &archive::to_bytes(&learner.state(), &self.point(step, meter.loss))?)
     }
 
-    /// Takes up the state, if there is one; answers the number of steps done and the mean loss.
+    /// Restores the saved state if it exists; returns the number of completed steps and the running mean of the loss.
     fn resume(&self, learner: &mut dyn Learner) -> anyhow::Result<(u64, Option<f64>)> {
         if !self.path.exists() {
             return Ok((0, None));
         }
-        let mut take_up = || {
+        let mut restore = || {
             let (state, got): (Tensors, ResumePoint) = archive::from_bytes(&std::fs::read(&self.path)?)?;
             let expected = self.point(got.step, got.loss);
             ensure!(expected == got, "expected the state of this run, {expected:?}, got that of another, {got:?}");
@@ -160,7 +165,7 @@ impl Saved<'_> {
             info!(step = got.step, "resumed");
             Ok((got.step, got.loss))
         };
-        take_up().with_context(|| format!("resuming from {} (remove it to start anew)", self.path.display()))
+        restore().with_context(|| format!("resuming from {} (remove it to start anew)", self.path.display()))
     }
 
     fn remove(&self) -> anyhow::Result<()> {

@@ -1,6 +1,6 @@
-//! Which samples a training run sees, in which order, towards which goals: a function of the data, the recipe and the seed.
+//! Sampler: samples, their goals and their order in a training run, determined by data, recipe and seed.
 
-use crate::training::augment::Look;
+use crate::training::augment::Augmentation;
 use crate::training::dataset::{Dataset, Episode};
 use cpn::recipe::{GoalSampling, Recipe, Training};
 use cpn::{Batch, Frames, images};
@@ -9,49 +9,49 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::HashMap;
 
-/// A moment of an episode and what it is to lead to.
+/// A sample: an observation of an episode, and a later frame as its goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sample {
-    /// The episode among all.
+    /// Index of the episode.
     pub episode: u32,
     /// Step of the observation.
     pub step: u32,
-    /// Step of the goal, a later one.
+    /// Step of the goal, after the observation.
     pub goal: u32,
 }
 
-/// Draws the samples of a run.
+/// Sampler of a run.
 #[derive(Debug, Clone, Copy)]
 pub struct Sampler<'a> {
     dataset: &'a Dataset,
     training: &'a Training,
-    /// H.
+    /// H, the planning horizon.
     horizon: usize,
-    /// Whether the method looks at the goal.
+    /// True if the method uses the goal.
     needs_goal: bool,
     seed: u64,
 }
 
 impl<'a> Sampler<'a> {
-    /// For a valid recipe.
+    /// A sampler for a valid recipe.
     pub fn new(dataset: &'a Dataset, recipe: &'a Recipe, seed: u64) -> Self {
         let Recipe { model, training } = recipe;
         let needs_goal = model.method.is_goal_conditioned() || model.method.plans();
         Self { dataset, training, horizon: model.horizon as usize, needs_goal, seed }
     }
 
-    /// Steps of an epoch.
+    /// Number of steps of an epoch.
     pub fn steps_per_epoch(&self) -> u64 {
         self.dataset.sample_count().div_ceil(self.training.batch_size) as u64
     }
 
-    /// Samples of the first `step` steps of a run.
+    /// Number of samples in the first `step` steps of a run.
     pub fn samples_before(&self, step: u64) -> u64 {
         let (epochs, steps) = (step / self.steps_per_epoch(), step % self.steps_per_epoch());
         epochs * self.dataset.sample_count() as u64 + steps * self.training.batch_size as u64
     }
 
-    /// The batches of a run from step `start` on, one after the other, for as long as they are asked for.
+    /// Batches of a run from step `start` on, without end.
     pub fn batches(self, start: u64) -> impl Iterator<Item = Batch> {
         let per_epoch = self.steps_per_epoch();
         let epochs = (start / per_epoch..).map(move |epoch| (epoch, self.epoch(epoch)));
@@ -66,10 +66,11 @@ impl<'a> Sampler<'a> {
         })
     }
 
-    /// Every frame with an action once, in an order that the seed and the epoch decide.
+    /// Samples of an epoch: all frames with an action once, in an order determined by seed and epoch.
     pub fn epoch(&self, epoch: u64) -> Vec<Sample> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(epoch);
+
         let mut draws = Vec::new();
         for (index, episode) in self.dataset.episodes().iter().enumerate() {
             let mut steps: Vec<usize> = (0..episode.action_count).collect();
@@ -77,6 +78,7 @@ impl<'a> Sampler<'a> {
             draws.extend(steps.chunks(self.training.samples_per_draw).map(|steps| (index, steps.to_vec())));
         }
         draws.shuffle(&mut rng);
+
         let mut samples = Vec::with_capacity(self.dataset.sample_count());
         for (index, steps) in draws {
             let last = self.dataset.episodes()[index].action_count;
@@ -95,17 +97,18 @@ impl<'a> Sampler<'a> {
         samples
     }
 
-    /// The batch of some samples, those of step `step` of the run, which decides how the images are changed.
+    /// The batch of `samples`; `step` of the run determines the augmentation.
     pub fn batch(&self, step: u64, samples: &[Sample]) -> Batch {
         let (horizon, size) = (self.horizon, self.dataset.action_size());
-        let mut rows = Rows { dataset: self.dataset, places: HashMap::new(), frames: Vec::new() };
+        let mut frames = BatchFrames { dataset: self.dataset, rows: HashMap::new(), frames: Vec::new() };
         let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         let mut actions = vec![0.0; samples.len() * horizon * size];
         let mut mask = vec![0.0; samples.len() * horizon];
+
         for (row, sample) in samples.iter().enumerate() {
-            observations.push(rows.place(sample.episode, sample.step));
-            // Any frame will do for a method that does not look.
-            goals.push(rows.place(sample.episode, if self.needs_goal { sample.goal } else { sample.step }));
+            observations.push(frames.row(sample.episode, sample.step));
+            // The observation is a placeholder for methods without a goal: it adds no frame to the batch.
+            goals.push(frames.row(sample.episode, if self.needs_goal { sample.goal } else { sample.step }));
             let episode = &self.dataset.episodes()[sample.episode as usize];
             for t in 0..horizon {
                 let at = row * horizon + t;
@@ -114,26 +117,28 @@ impl<'a> Sampler<'a> {
                 }
             }
         }
-        Batch { frames: self.frames(step, &rows.frames), observations, goals, actions, mask }
+        Batch { frames: self.frames(step, &frames.frames), observations, goals, actions, mask }
     }
 
-    /// Some frames, each of an episode and at an index among all, as the encoder takes them.
+    /// Frames by episode and index in the dataset; images are augmented.
     fn frames(&self, step: u64, frames: &[(u32, usize)]) -> Frames {
         match self.dataset.frames() {
             Frames::Images(pixels) => {
-                let (mut looks, mut changed) = (HashMap::new(), Vec::with_capacity(frames.len() * images::BYTES));
+                let mut augmentations = HashMap::new();
+                let mut augmented = Vec::with_capacity(frames.len() * images::BYTES);
                 for &(episode, index) in frames {
-                    let draw = || Look::draw(self.training, self.seed, step, episode);
+                    let draw = || Augmentation::draw(self.training, self.seed, step, episode);
                     let frame = &pixels[index * images::BYTES..][..images::BYTES];
-                    looks.entry(episode).or_insert_with(draw).append(frame, &mut changed);
+                    augmentations.entry(episode).or_insert_with(draw).append(frame, &mut augmented);
                 }
-                Frames::Images(changed)
+                Frames::Images(augmented)
             }
             Frames::Positions(all) => Frames::Positions(frames.iter().map(|&(_, index)| all[index]).collect()),
         }
     }
 
-    /// The mean of the actions that planned action t stands for, up to the goal; whether there is any.
+    /// Target of planned action t: adds the mean of its block of demonstrated actions before the goal to `mean`; false if there is
+    /// none.
     fn block(&self, episode: &Episode, sample: &Sample, t: usize, mean: &mut [f32]) -> bool {
         let block = self.training.action_block;
         let first = sample.step as usize + t * block;
@@ -148,24 +153,24 @@ impl<'a> Sampler<'a> {
     }
 }
 
-/// The distinct frames of a batch.
-struct Rows<'a> {
+/// Distinct frames of a batch.
+struct BatchFrames<'a> {
     dataset: &'a Dataset,
-    /// By index among all frames, the row.
-    places: HashMap<usize, usize>,
-    /// By row, the episode and the index.
+    /// Rows in the batch, by index in the dataset.
+    rows: HashMap<usize, usize>,
+    /// Episode and index in the dataset, by row.
     frames: Vec<(u32, usize)>,
 }
 
-impl Rows<'_> {
-    /// The row of a frame, which is added if it is new.
-    fn place(&mut self, episode: u32, step: u32) -> usize {
+impl BatchFrames<'_> {
+    /// Row of a frame, which is added if new.
+    fn row(&mut self, episode: u32, step: u32) -> usize {
         let index = self.dataset.episodes()[episode as usize].first_frame + step as usize;
         let next = self.frames.len();
-        let place = *self.places.entry(index).or_insert(next);
-        if place == next {
+        let row = *self.rows.entry(index).or_insert(next);
+        if row == next {
             self.frames.push((episode, index));
         }
-        place
+        row
     }
 }

@@ -1,12 +1,12 @@
-//! TensorBoard event files: scalars as TensorFlow's `Event` messages, each framed as a TFRecord.
+//! TensorBoard event files: scalars as TensorFlow's `Event` messages, framed as TFRecords.
 //!
-//! Only the fields that scalars need are declared, under the numbers of `event.proto` and `summary.proto`.
+//! Only the fields of scalars are declared, with the numbers of `event.proto` and `summary.proto`.
 
 use crc::{CRC_32_ISCSI, Crc};
 use prost::Message;
 use std::io::{Result, Write};
 
-/// Checksum of TFRecords, before it is masked.
+/// Checksum of TFRecords, before masking.
 const CRC32C: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 /// Entry of an event file.
@@ -26,13 +26,13 @@ pub struct Event {
 /// Content of an event.
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub enum Content {
-    /// Format of the file: its first event.
+    /// Format of the file, in its first event.
     #[prost(string, tag = "3")]
     FileVersion(String),
     /// Scalars.
     #[prost(message, tag = "5")]
     Summary(Summary),
-    /// Start of a session: TensorBoard then forgets older events.
+    /// Start of a session, at which TensorBoard drops older events.
     #[prost(message, tag = "7")]
     SessionLog(SessionLog),
 }
@@ -51,7 +51,7 @@ pub struct Scalar {
     /// Name of the series.
     #[prost(string, tag = "1")]
     pub tag: String,
-    /// Value; zero is written, too.
+    /// Value; optional, so that zero is encoded.
     #[prost(float, optional, tag = "2")]
     pub value: Option<f32>,
 }
@@ -71,10 +71,10 @@ pub(crate) struct EventWriter<W> {
 }
 
 impl<W: Write> EventWriter<W> {
-    /// Begins a file, in place of older ones of the same run.
+    /// Begins a file that replaces older ones of the same run.
     ///
     /// # Errors
-    /// If it cannot be written.
+    /// If the file cannot be written.
     pub(crate) fn new(file: W, unix_seconds: f64) -> Result<Self> {
         let mut writer = Self { file };
         for content in [Content::FileVersion("brain.Event:2".into()), Content::SessionLog(SessionLog { status: 1 })] {
@@ -86,7 +86,7 @@ impl<W: Write> EventWriter<W> {
     /// Adds the scalars of a step.
     ///
     /// # Errors
-    /// If they cannot be written.
+    /// If the file cannot be written.
     pub(crate) fn write_scalars(&mut self, step: i64, unix_seconds: f64, scalars: &[(&str, f32)]) -> Result<()> {
         let values = scalars.iter().map(|&(tag, value)| Scalar { tag: tag.into(), value: Some(value) });
         let content = Content::Summary(Summary { values: values.collect() });
@@ -98,7 +98,7 @@ impl<W: Write> EventWriter<W> {
     }
 }
 
-/// TFRecord: length, its checksum, data, their checksum, all little-endian.
+/// A TFRecord: length, checksum of the length, data, checksum of the data, in little endian.
 fn frame(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let [of_length, of_data] = [&length[..], data].map(|bytes| masked_crc(bytes).to_le_bytes());
@@ -109,7 +109,7 @@ fn masked_crc(bytes: &[u8]) -> u32 {
     CRC32C.checksum(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
-/// The events of a file's bytes, up to the first frame that is cut or damaged.
+/// Events of a file, up to the first truncated or damaged record.
 pub fn read(mut bytes: &[u8]) -> Vec<Event> {
     let mut events = Vec::new();
     while let Some((event, rest)) = next(bytes) {
@@ -131,7 +131,7 @@ fn next(bytes: &[u8]) -> Option<(Event, &[u8])> {
 mod tests {
     use super::*;
 
-    /// The bytes are those of TensorBoard 2.21's own messages and checksum.
+    /// The expected bytes come from TensorBoard 2.21.
     #[test]
     fn messages_and_checksums_are_those_of_tensorboard() {
         let encoded =
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_was_cut_is_read_up_to_there() -> Result<()> {
+    fn a_truncated_file_is_read_up_to_the_last_record() -> Result<()> {
         let mut file = Vec::new();
         EventWriter::new(&mut file, 1.0)?.write_scalars(7, 2.0, &[("train/loss", 0.0), ("train/rate", 0.5)])?;
         let events = read(&file);

@@ -1,1 +1,1 @@
-"""Plans of the planning methods, as a library makes them and as a service serves them."""
+"""Benchmark of planning, as a library and as a service."""

@@ -1,4 +1,4 @@
-"""How fast this machine multiplies: the rate of large float32 matrix products, as a line of JSON."""
+"""Throughput of large float32 matrix products on this machine, as a line of JSON."""
 
 import json
 import time
@@ -10,7 +10,7 @@ SIZE, TRIES = 1024, 20
 
 
 def main(threads: int) -> None:
-    """Prints operations a second, of the best try."""
+    """Prints the operations a second of the fastest try."""
     torch.set_num_threads(threads)
     left, right = torch.rand(2, SIZE, SIZE)
     out = torch.empty(SIZE, SIZE)

@@ -1,4 +1,4 @@
-"""Plans of ours, PyTorch, JAX and ONNX Runtime in turns, then of services; writes plan.json, plan.svg and load.svg.
+"""Planning by CPN, PyTorch, JAX and ONNX Runtime, then by services; writes plan.json, plan.svg and load.svg.
 
 make bench-plan
 """
@@ -37,16 +37,16 @@ GROWTH = {
     "horizon": (1, 5, 10, 20),
     "updates": (0, 1, 2, 4),
 }
-"""What grows of CPN, one at a time; the others are as in the paper, the batch 1."""
+"""Varied sizes of CPN, one at a time; the others are the paper's, and the batch is 1."""
 UNIT = "plans/s"
 BFLOAT16 = "ours, bfloat16"
 RELATIVE_TOLERANCE = ABSOLUTE_TOLERANCE = 1e-3
-"""Between the first plans of contenders."""
+"""Tolerances between the first plans of contenders."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is planned with."""
+    """Setting of a comparison."""
 
     method: str
     batch: int = 1
@@ -54,12 +54,12 @@ class Setting:
     engine: str = "native"
     device: str = "cpu"
     grown: str | None = None
-    """What differs from the paper's values."""
+    """Name of the varied size."""
     value: int = 0
 
     @property
     def name(self) -> str:
-        """For rows and people."""
+        """Name in rows and output."""
         if self.grown:
             return f"{self.method}, {self.grown} {self.value}"
         name = f"{self.method}, batch {self.batch}, {self.threads} thread{'s'[: self.threads > 1]}"
@@ -73,12 +73,12 @@ FLOORS = {
     (Setting("cpn", batch=64).name, COMPILED): 2.0,
     (Setting("cpn", batch=64).name, JAX): 2.0,
 }
-"""Least ratios on one thread. ONNX Runtime, which plans less, has none."""
+"""Minimum ratios on one thread. ONNX Runtime has none, since it computes no updates."""
 
 
 @contextmanager
 def written_model(ours: Sequence[str], setting: Setting) -> Iterator[Path]:
-    """A file that ours writes for a setting."""
+    """File of a setting, written by CPN's bench."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.safetensors"
         options = ["--write-model", str(path), "--method", setting.method]
@@ -89,7 +89,7 @@ def written_model(ours: Sequence[str], setting: Setting) -> Iterator[Path]:
 
 
 def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort: Effort) -> list[Row]:
-    """Takes all in turns, and prints what they came to; answers a row for each peer."""
+    """Compares contenders in interleaved turns, and prints the results; returns a row for each peer."""
     with written_model(ours, setting) as path:
         options = ["--model", str(path), "--batch", str(setting.batch), "--threads", str(setting.threads)]
         options += ["--device", setting.device] if setting.device != "cpu" else []
@@ -113,7 +113,7 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
 
 
 def compare_precisions(ours: Sequence[str], effort: Effort) -> list[Row]:
-    """Ours in bfloat16 beside ours in float32; prints by how much the shipped model's actions differ."""
+    """Compares CPN in bfloat16 with CPN in float32, and prints the differences of the shipped model's actions."""
     setting = Setting("cpn", max(BATCHES))
     checkpoint = str(Path(__file__).resolve().parents[5] / "models/cpn.safetensors")
     with written_model([*ours, "--checkpoint", checkpoint], setting) as path:
@@ -135,26 +135,26 @@ def compare_precisions(ours: Sequence[str], effort: Effort) -> list[Row]:
 
 @cache
 def operations_per_second(threads: int) -> float:
-    """What this machine can do on so many cores."""
+    """Floating-point operations a second of this machine on `threads` cores."""
     command = [*harness.pinned(threads), *module("plan.arithmetic", "--threads", str(threads))]
     measured = subprocess.run(command, check=True, stdout=subprocess.PIPE)
     return json.loads(measured.stdout)["operations_per_second"]
 
 
 def settings() -> list[Setting]:
-    """What all peers are compared in; on two cores where there are two."""
+    """Settings for all peers, on one core and, if available, on two."""
     threads = (1, 2)[: len(os.sched_getaffinity(0))]
     return [Setting("cpn", batch, count) for batch in BATCHES for count in threads] + [Setting("upn")]
 
 
 def main(ours: str, serve: str, out: Path, quick: bool = False) -> str | None:
-    """Compares everything, and writes the rows after each setting; returns what is wrong with them.
+    """Runs all comparisons, and writes the rows after each; returns the shortfalls.
 
     Args:
-        ours: The command of our contender.
-        serve: The command that measures our service.
+        ours: Command of CPN's contender.
+        serve: Command that measures CPN's service.
         out: Folder of the results.
-        quick: A few short turns against eager PyTorch and JAX, without growth: to see that it runs, not to quote.
+        quick: Few short turns, only against eager PyTorch and JAX, without varied sizes: a smoke test.
     """
     command = shlex.split(ours)
     rows: list[Row] = []

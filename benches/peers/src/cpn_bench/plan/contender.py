@@ -1,4 +1,4 @@
-"""How a contender is asked to plan: numbers of batches come in on stdin, what they took goes out as lines of JSON."""
+"""Protocol of a planning contender: numbers of batches on standard input, their times as lines of JSON on output."""
 
 import json
 import sys
@@ -18,10 +18,10 @@ Plans: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 class Contender(Protocol[Goals]):
-    """A planner that knows its goals."""
+    """Planner with embedded goals."""
 
     def embed(self, goals: NDArray[np.uint8]) -> Goals:
-        """Embeds goals `[B, 84, 84, 3]`, as the planner keeps them."""
+        """Embeddings of goals `[B, 84, 84, 3]`, in the planner's representation."""
         ...
 
     def plan(self, observations: NDArray[np.uint8], goals: Goals) -> Plans:
@@ -30,7 +30,7 @@ class Contender(Protocol[Goals]):
 
 
 def serve(contender: Contender[Goals], data: PlanModel, batch: int) -> None:
-    """Compiles and warms up, says so with the first plan, then plans as asked until stdin ends."""
+    """Compiles and warms up, prints the first plan, then plans on request until standard input ends."""
     starts = range(0, len(data.frames), batch)
     batches: Sequence[tuple[NDArray[np.uint8], Goals]] = [
         (data.frames[start : start + batch], contender.embed(data.goals[start : start + batch])) for start in starts

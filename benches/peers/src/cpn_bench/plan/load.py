@@ -1,4 +1,4 @@
-"""Clients of a planning server over HTTP: each asks anew as soon as it is answered."""
+"""Load generator for a planning server over HTTP: each client sends its next request after the answer."""
 
 import asyncio
 import json
@@ -13,7 +13,7 @@ from cpn_bench.plan.model import PlanModel
 
 
 async def drive(url: str, frames: list[bytes], clients: int, seconds: float) -> list[float]:
-    """The seconds that each answer took, of those asked for in so many seconds."""
+    """Latencies, in seconds, of the requests sent within `seconds`."""
     latencies: list[float] = []
     async with aiohttp.ClientSession(headers={"Content-Type": "application/octet-stream"}) as session:
         stop = time.perf_counter() + seconds
@@ -31,7 +31,7 @@ async def drive(url: str, frames: list[bytes], clients: int, seconds: float) -> 
 
 
 def main(url: str, model: Path, clients: int, seconds: float) -> None:
-    """Warms the server up, loads it, and prints what a client sees as a line of JSON."""
+    """Warms up and loads the server, and prints throughput and latencies as a line of JSON."""
     frames = [frame.tobytes() for frame in PlanModel.read(model).frames]
     asyncio.run(drive(url, frames, clients, seconds / 5))
     start = time.perf_counter()

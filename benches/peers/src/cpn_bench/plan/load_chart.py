@@ -1,4 +1,4 @@
-"""What clients of the services see as they grow in number."""
+"""Chart of throughput and latencies against the number of clients."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from cpn_bench.plan.service import Measurement
 
 
 def draw(measured: Sequence[Measurement], path: Path) -> None:
-    """Throughput, median and 99th percentile of the latency against clients, a line for every transport."""
+    """Draws throughput, median and 99th percentile of the latency, with a line for each transport."""
     figure = chart.figure()
     panels = figure.subplots(1, 3)
     quantities = ("plans_per_second", "p50_ms", "p99_ms")

@@ -1,8 +1,8 @@
-"""Plans by JAX: encoder, rollout and updates as one compiled function.
+"""Planner in JAX: encoder, rollout and updates as one compiled function.
 
-Tried for CPN at the paper's sizes, one thread (ms a batch, medians of 7 turns on a busy machine), batch 1 and 64: with
-the weights as constants of the function, as they are here, 0.73 and 39.5; as its arguments 1.58 and 40.1, and then with
-the gated product as a sum 1.97 and 42.3, with a `vmap` over plans 1.11 and 38.0.
+Alternatives, measured for CPN at the paper's sizes, one thread (ms a batch, medians of 7 turns on a busy machine),
+batch 1 and 64: with the weights as constants of the function, as implemented here, 0.73 and 39.5; as its arguments 1.58
+and 40.1, and then with the gated product as a sum 1.97 and 42.3, with a `vmap` over plans 1.11 and 38.0.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ from cpn_bench.plan.model import PlanModel
 
 
 class Planner:
-    """Compiled functions of a model."""
+    """Planner of compiled functions."""
 
     def __init__(self, data: PlanModel) -> None:
         weights, model = jax.device_put(data.weights), data.model
@@ -34,7 +34,7 @@ class Planner:
         self.encode, self.plan_arrays = jax.jit(encode), jax.jit(plan)
 
     def embed(self, goals: NDArray[np.uint8]) -> Array:
-        """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
+        """Embeddings `[B, Z]` of goals `[B, 84, 84, 3]`."""
         return self.encode(goals)
 
     def plan(self, observations: NDArray[np.uint8], goals: Array) -> Plans:
@@ -44,7 +44,7 @@ class Planner:
 
 
 def main(model: Path, batch: int, threads: int) -> None:
-    """Plans as asked on stdin."""
+    """Plans on request on standard input."""
     check_cores(threads)
     data = PlanModel.read(model)
     serve(Planner(data), data, batch)

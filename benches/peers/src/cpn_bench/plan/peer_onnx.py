@@ -1,4 +1,4 @@
-"""Rollouts by ONNX Runtime, exported from PyTorch: encoder and policy, without updates, which need a gradient."""
+"""Rollouts by ONNX Runtime, exported from PyTorch: encoder and rollout, without updates, which need gradients."""
 
 import tempfile
 from pathlib import Path
@@ -16,19 +16,19 @@ from cpn_bench.plan.model import PlanModel
 
 
 class Rollout(nn.Module):
-    """From observations and embedded goals to the policy's rollout."""
+    """Encoder and rollout as a module for export."""
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
         self.agent = agent
 
     def forward(self, observations: Tensor, goals: Tensor) -> Tensor:
-        """`[B, 84, 84, 3]` bytes and `[B, Z]` to `[B, H, A]`."""
+        """Actions `[B, H, A]` of observations `[B, 84, 84, 3]`, bytes, and goals `[B, Z]`."""
         return self.agent.rollout(self.agent.encoder(observations), goals)
 
 
 def session(graph: nn.Module, inputs: dict[str, Tensor], threads: int) -> onnxruntime.InferenceSession:
-    """Exports a module for inputs of these shapes, and loads it."""
+    """Exports a module for the shapes of `inputs`, and loads it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     with tempfile.TemporaryDirectory() as folder:
@@ -38,7 +38,7 @@ def session(graph: nn.Module, inputs: dict[str, Tensor], threads: int) -> onnxru
 
 
 class Planner:
-    """A session that rolls out for batches of one size."""
+    """Planner for batches of one size, without updates."""
 
     def __init__(self, data: PlanModel, batch: int, threads: int) -> None:
         self.agent = Agent(data.model, tensors(data.weights)).requires_grad_(False)
@@ -47,17 +47,17 @@ class Planner:
         self.session = session(Rollout(self.agent).eval(), inputs, threads)
 
     def embed(self, goals: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
+        """Embeddings `[B, Z]` of goals `[B, 84, 84, 3]`."""
         return self.agent.encoder(torch.from_numpy(goals)).numpy()
 
     def plan(self, observations: NDArray[np.uint8], goals: NDArray[np.float32]) -> Plans:
-        """The rollout from observations `[B, 84, 84, 3]` to goals `[B, Z]`, without losses."""
+        """Rollouts from observations `[B, 84, 84, 3]` to goals `[B, Z]`, without losses."""
         (actions,) = self.session.run(None, {"observations": observations, "goals": goals})
         return np.asarray(actions), np.empty((0, len(observations)), np.float32)
 
 
 def main(model: Path, batch: int, threads: int) -> None:
-    """Plans as asked on stdin."""
+    """Plans on request on standard input."""
     torch.set_num_threads(threads)
     data = PlanModel.read(model)
     serve(Planner(data, batch, threads), data, batch)

@@ -1,10 +1,10 @@
-"""Plans by PyTorch, eager or compiled, written as its documentation would have them.
+"""Planner in PyTorch, eager or compiled, in the style of its documentation.
 
-Tried for CPN at the paper's sizes, one thread, with glibc told to keep freed memory (ms a batch, medians of 7 turns
-on a busy machine). Eager, batch 1 and 64: 5.9 and 34.6 as it stands here; the gated product as `baddbmm` 5.4 and
-42.3, as `matmul` 5.5 and 47.1; with channels first 6.4 and 36.3; `torch.func.grad` instead of `autograd.grad` 9.8 and
-39.2. Compiled as one graph, encoder and inner gradient in it: 1.83 and 23.6; with `cpp_wrapper` 1.40 and 23.5, which
-is what stands here; with `freezing` 4.48 and 24.7.
+Alternatives, measured for CPN at the paper's sizes, one thread, with glibc told to keep freed memory (ms a batch,
+medians of 7 turns on a busy machine). Eager, batch 1 and 64: 5.9 and 34.6 as implemented here; the gated product as
+`baddbmm` 5.4 and 42.3, as `matmul` 5.5 and 47.1; with channels first 6.4 and 36.3; `torch.func.grad` instead of
+`autograd.grad` 9.8 and 39.2. Compiled as one graph, encoder and inner gradient in it: 1.83 and 23.6; with `cpp_wrapper`
+1.40 and 23.5, as implemented here; with `freezing` 4.48 and 24.7.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ from cpn_bench.plan.model import PlanModel
 
 
 class Planner:
-    """A frozen agent that plans."""
+    """Planner of an agent with frozen weights."""
 
     def __init__(self, data: PlanModel, compiled: bool = False, device: str = "cpu") -> None:
         self.device = device
@@ -32,7 +32,7 @@ class Planner:
 
     @torch.no_grad()
     def embed(self, goals: NDArray[np.uint8]) -> Tensor:
-        """Goals `[B, 84, 84, 3]` to `[B, Z]`."""
+        """Embeddings `[B, Z]` of goals `[B, 84, 84, 3]`."""
         return self.agent.encoder(torch.from_numpy(goals).to(self.device))
 
     @torch.no_grad()
@@ -42,7 +42,7 @@ class Planner:
         return actions.cpu().numpy(), losses.cpu().numpy()
 
     def eager(self, observations: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
-        """Encoder, rollout, and updates by a tape of the inner loss alone."""
+        """Encoder, rollout, and updates, with a graph of the inner loss only."""
         x = self.agent.encoder(observations)
         actions, losses = self.agent.rollout(x, goals), []
         for _ in range(self.agent.model.updates):
@@ -55,7 +55,7 @@ class Planner:
         return actions, torch.stack([*losses, self.agent.inner_losses(actions, x, goals)])
 
     def traced(self, observations: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, with the gradient that the compiler sees through."""
+        """Computation of `eager` with `torch.func.grad`, which the compiler can trace."""
 
         def inner_loss(actions: Tensor) -> tuple[Tensor, Tensor]:
             losses = self.agent.inner_losses(actions, x, goals)
@@ -77,7 +77,7 @@ def main(
     compile: bool = False,  # noqa: A002 - the option's name
     device: str = "cpu",
 ) -> None:
-    """Plans as asked on stdin."""
+    """Plans on request on standard input."""
     torch.set_num_threads(threads)
     data = PlanModel.read(model)
     serve(Planner(data, compiled=compile, device=device), data, batch)

@@ -1,4 +1,4 @@
-"""Our planning service and LitServe under load, each with its clients on the same cores."""
+"""Load tests of CPN's planning service and of LitServe, each with its clients on the same cores."""
 
 import json
 import os
@@ -21,51 +21,51 @@ from cpn_bench.harness import ENVIRONMENT, Row, median, module
 
 LITSERVE = "LitServe + PyTorch"
 LIBRARY = "library"
-"""Our planner without a service, as many plans at a time as there are clients."""
+"""CPN's planner without a service, with the number of clients as the batch size."""
 COMPARED = ("zenoh tcp", "gRPC")
-"""Our transports that cross a network as HTTP does."""
+"""CPN's transports over TCP, for comparison with HTTP."""
 FEW, MANY = 1, 32
-"""Clients."""
+"""Numbers of clients."""
 START_SECONDS, STOP_SECONDS = 120.0, 10.0
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What so many clients see, each asking anew as soon as it is answered."""
+    """Throughput and latencies of a number of clients, each of which sends its next request after the answer."""
 
     transport: str
     clients: int
     plans_per_second: float
     p50_ms: float
-    """Of what a client waits for a plan."""
+    """Median latency of a plan at the client."""
     p99_ms: float
     n: int
-    """Plans."""
+    """Number of plans."""
     server_ms_p50: float | None = None
-    """Of what the server says that a plan took it."""
+    """Median time of a plan, reported by the server."""
 
 
 @dataclass(frozen=True)
 class Overload:
-    """What becomes of more requests than can be answered, each with a deadline."""
+    """Results of an overload of requests with a deadline."""
 
     overload: float
-    """Times as many as can be answered."""
+    """Rate of requests, as a multiple of the capacity."""
     capacity_plans_per_second: float
     deadline_ms: int
     n: int
-    """Requests: answered, refused, or answered by an error when the deadline had passed."""
+    """Number of requests: answered, refused, or answered with an error after the deadline."""
     answered: int
     answered_in_time: int
     refused: int
     late: int
     refused_p50_ms: float
-    """How long a refusal takes."""
+    """Median latency of a refusal."""
     refused_p99_ms: float
 
 
 def ours(command: Sequence[str], seconds: float, turns: int) -> tuple[list[Measurement], Overload]:
-    """Has our bench measure our service over every transport, in so many turns of so many seconds each."""
+    """Measures CPN's service by its bench, over all transports, in `turns` of `seconds` each."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "load.jsonl"
         options = ["--out", str(path), "--seconds", str(seconds), "--turns", str(turns)]
@@ -76,7 +76,7 @@ def ours(command: Sequence[str], seconds: float, turns: int) -> tuple[list[Measu
 
 
 def litserve(model: Path, seconds: float) -> list[Measurement]:
-    """Measures LitServe with few clients and many, for so many seconds each."""
+    """Measures LitServe with few and many clients, for `seconds` each."""
     with _server(model) as address:
         options = ["--url", f"{address}/predict", "--model", str(model), "--seconds", str(seconds)]
 
@@ -90,12 +90,12 @@ def litserve(model: Path, seconds: float) -> list[Measurement]:
 
 @contextmanager
 def _server(model: Path) -> Iterator[str]:
-    """The address of a LitServe that is ready."""
+    """Address of a LitServe server, once it is ready."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = module("plan.litserve_server", "--model", str(model), "--port", str(port))
-    # A session of its own, so that its workers end with it.
+    # A separate session, so that its workers are ended with it.
     process = subprocess.Popen(command, stdout=sys.stderr, env=os.environ | ENVIRONMENT, start_new_session=True)
     try:
         address = f"http://127.0.0.1:{port}"
@@ -123,7 +123,7 @@ def _wait(process: "subprocess.Popen[bytes]", url: str) -> None:
 
 
 def tell(measured: Sequence[Measurement]) -> None:
-    """Prints what was measured."""
+    """Prints measurements."""
     for m in measured:
         server = "" if m.server_ms_p50 is None else f", {m.server_ms_p50:.2f} ms in the server"
         print(
@@ -134,7 +134,7 @@ def tell(measured: Sequence[Measurement]) -> None:
 
 
 def tell_overload(o: Overload) -> None:
-    """Prints how overload was borne."""
+    """Prints the results under overload."""
     print(
         f"overload, {o.overload:.0f} times {o.capacity_plans_per_second:.0f} plans/s, deadline {o.deadline_ms} ms: "
         f"of {o.n} requests {o.answered} answered, {o.answered_in_time} of them in time, {o.refused} refused (p50 "
@@ -144,7 +144,7 @@ def tell_overload(o: Overload) -> None:
 
 
 def medians(measured: Sequence[Measurement]) -> list[Measurement]:
-    """Of the turns of each transport with so many clients."""
+    """Medians over turns, for each transport and number of clients."""
     turns: dict[tuple[str, int], list[Measurement]] = {}
     for m in measured:
         turns.setdefault((m.transport, m.clients), []).append(m)
@@ -159,7 +159,7 @@ def medians(measured: Sequence[Measurement]) -> list[Measurement]:
 
 
 def tell_cost(measured: Sequence[Measurement]) -> None:
-    """Prints what the service adds to plans, for one client and for many, from turns beside the library's."""
+    """Prints the added latency with one client and the relative throughput with many, against the library."""
 
     def turns(transport: str, clients: int) -> list[Measurement]:
         return [m for m in measured if m.transport == transport and m.clients == clients]
@@ -177,7 +177,7 @@ def tell_cost(measured: Sequence[Measurement]) -> None:
 
 
 def rows(measured: Sequence[Measurement], command: str) -> list[Row]:
-    """Throughput with many clients and latency with one, beside LitServe's."""
+    """Rows of throughput with many clients and latency with one, against LitServe."""
     of = {(m.transport, m.clients): m for m in measured}
     found = []
     for transport in COMPARED:

@@ -1,1 +1,1 @@
-"""Training steps of the compared methods."""
+"""Benchmark of training steps."""

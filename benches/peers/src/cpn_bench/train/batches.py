@@ -1,4 +1,4 @@
-"""What every contender starts from: the same model, weights and batches, in one file that ours writes."""
+"""Model, weights and batches shared by all training contenders, in a file written by CPN's bench."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,25 +12,25 @@ from cpn_bench.model import ModelConfig, read
 
 @dataclass(frozen=True)
 class Batches:
-    """N batches of B samples whose pictures are indices into the distinct frames."""
+    """N batches of B samples, with images as indices of distinct frames."""
 
     model: ModelConfig
     weights: dict[str, NDArray[Any]]
-    """By their names in a checkpoint; float32, or float64 in checks of gradients."""
+    """Weights by their names in a checkpoint; float32, or float64 in gradient checks."""
     frames: NDArray[np.uint8]
-    """`[F, 84, 84, 3]`."""
+    """Distinct frames, `[F, 84, 84, 3]`."""
     observation_index: NDArray[np.int64]
-    """`[N, B]`."""
+    """Indices of the observations, `[N, B]`."""
     goal_index: NDArray[np.int64]
-    """`[N, B]`."""
+    """Indices of the goals, `[N, B]`."""
     actions: NDArray[Any]
-    """The demonstrated ones, `[N, B, H, A]`."""
+    """Demonstrated actions, `[N, B, H, A]`."""
     mask: NDArray[Any]
-    """1 where the demonstration has an action, `[N, B, H]`."""
+    """1 for an action within the demonstration, else 0, `[N, B, H]`."""
 
     @classmethod
     def read(cls, path: Path, method: str) -> "Batches":
-        """Reads a file of batches for a model of this method."""
+        """Reads the file, which must be of `method`."""
         model, weights, tensors = read(path)
         if model.method != method:
             raise ValueError(f"method of {path}: expected {method}, got {model.method}")
@@ -41,6 +41,6 @@ class Batches:
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything but the weights, by field."""
+        """Fields without model and weights, by name."""
         fields = ("frames", "observation_index", "goal_index", "actions", "mask")
         return {field: getattr(self, field) for field in fields}

@@ -1,4 +1,4 @@
-"""Training steps of ours, PyTorch and JAX on the same batches in turns; writes runs/bench/train.json and train.svg.
+"""Training steps of CPN, PyTorch and JAX on the same batches; writes runs/bench/train.json and train.svg.
 
 make bench-train
 """
@@ -19,7 +19,7 @@ from cpn_bench.harness import COMPILED, CURVE, EAGER, JAX, MAIN, OURS, QUICK, Ef
 
 COMMAND = "make bench-train"
 BFLOAT16 = "PyTorch eager, bfloat16"
-"""Its encoder by `torch.autocast`, as ours where the processor has instructions for it."""
+"""With the encoder in bfloat16 by `torch.autocast`, as in CPN on processors with instructions for it."""
 METHODS = ("bc", "te-bc", "upn", "cpn")
 PEERS = {
     EAGER: module("train.peer_torch"),
@@ -33,31 +33,31 @@ GROWTH = {
     "updates": (0, 1, 2),
     "batch": (32, 128, 512),
 }
-"""What grows of CPN, one at a time; the others are as in the paper, the batch 128.
+"""Varied sizes of CPN, one at a time; the others are the paper's, and the batch is 128.
 
-Longer plans of an untrained model leap, and no two libraries round a leap alike: first losses could not be compared.
+Longer plans of an untrained model are chaotic and amplify rounding errors: first losses would not be comparable.
 """
 BATCH = 128
 UNIT = "samples/s"
 LOSS_TOLERANCE = 1e-3
-"""Relative, between the first losses of contenders."""
+"""Relative tolerance between the first losses of contenders."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is trained."""
+    """Setting of a comparison."""
 
     method: str
     threads: int = 1
     engine: str = "native"
     device: str = "cpu"
     grown: str | None = None
-    """What differs from the paper's values."""
+    """Name of the varied size."""
     value: int = 0
 
     @property
     def name(self) -> str:
-        """For rows and people."""
+        """Name in rows and output."""
         if self.grown:
             return f"{self.method}, {self.grown} {self.value}"
         name = f"{self.method}, {self.threads} thread{'s'[: self.threads > 1]}"
@@ -65,7 +65,7 @@ class Setting:
 
     @property
     def batch(self) -> int:
-        """B."""
+        """B, the batch size."""
         return self.value if self.grown == "batch" else BATCH
 
 
@@ -79,7 +79,7 @@ FLOORS = {
 
 
 def write_batches(ours: Sequence[str], path: Path, setting: Setting) -> None:
-    """Has ours write the batches and weights of a setting."""
+    """Writes the batches and weights of a setting, by CPN's bench."""
     options = ["--write-batches", str(path), "--method", setting.method]
     if setting.grown:
         options += [f"--{setting.grown}", str(setting.value)]
@@ -87,7 +87,7 @@ def write_batches(ours: Sequence[str], path: Path, setting: Setting) -> None:
 
 
 def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort: Effort) -> tuple[list[Row], dict]:
-    """Takes all in turns; answers a row for each peer, and the seconds of the stages of our step."""
+    """Compares contenders in interleaved turns; returns a row for each peer, and the seconds of CPN's stages."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "batches.safetensors"
         write_batches(ours, path, setting)
@@ -103,12 +103,12 @@ def compare(ours: Sequence[str], peers: Sequence[str], setting: Setting, effort:
 
 
 def main(ours: str, out: Path, quick: bool = False) -> str | None:
-    """Compares everything, and writes the rows after each setting; returns what is wrong with them.
+    """Runs all comparisons, and writes the rows after each; returns the shortfalls.
 
     Args:
-        ours: The command of our contender.
+        ours: Command of CPN's contender.
         out: Folder of the results.
-        quick: A few short turns against eager PyTorch and JAX, without growth: to see that it runs, not to quote.
+        quick: Few short turns, only against eager PyTorch and JAX, without varied sizes: a smoke test.
     """
     command = shlex.split(ours)
     rows: list[Row] = []

@@ -1,4 +1,4 @@
-"""How a contender is asked to train: numbers of steps come in on stdin, what they took goes out as lines of JSON."""
+"""Protocol of a training contender: numbers of steps on standard input, their times as lines of JSON on output."""
 
 import json
 import sys
@@ -12,15 +12,15 @@ WARM_UP_STEPS = 5
 
 
 class Contender(Protocol):
-    """A model with its optimiser and its batches."""
+    """Model with its optimiser and its batches."""
 
     def step(self, number: int) -> Callable[[], float]:
-        """Takes the training step of this number; the answer waits for it and tells the loss before the update."""
+        """Starts a training step; the returned function waits for it and returns the loss before the update."""
         ...
 
 
 def serve(contender: Contender) -> None:
-    """Compiles and warms up, says so with the first loss, then trains as asked until stdin ends."""
+    """Compiles and warms up, prints the first loss, then trains on request until standard input ends."""
     first = contender.step(0)()
     for number in range(1, WARM_UP_STEPS):
         contender.step(number)()

@@ -1,9 +1,9 @@
-"""The methods in JAX: a whole training step, its gather included, as one compiled function with donated weights.
+"""Training in JAX: a step, with its gather, as one compiled function with donated weights.
 
-Tried for CPN at the paper's sizes, batch 128, one thread (samples per second of CPU time, medians of 4 interleaved
-turns on a busy machine): batched arrays with unrolled steps 330, which is what stands here; the gated product as a sum
-instead of an einsum 321; a `vmap` over plans 239; `lax.scan` over the steps, with the sum, 151. Most of the time goes
-into the convolutions: forward and backward of 256 pictures take 0.36 s of CPU time with channels last, 0.35 to 0.37
+Alternatives, measured for CPN at the paper's sizes, batch 128, one thread (samples per second of CPU time, medians of 4
+interleaved turns on a busy machine): batched arrays with unrolled steps, as implemented here, 330; the gated product as
+a sum instead of an einsum 321; a `vmap` over plans 239; `lax.scan` over the steps, with the sum, 151. Most of the time
+goes into the convolutions: forward and backward of 256 images take 0.36 s of CPU time with channels last, 0.35 to 0.37
 with channels first and with XLA's flags `ynn_fusion_type`, `use_onednn` and `fast_math`, 0.42 as matrix products of
 patches.
 """
@@ -30,7 +30,7 @@ OPTIMIZER = optax.chain(optax.clip_by_global_norm(MAX_GRADIENT_NORM), optax.adam
 def outer_loss(
     weights: Weights, model: ModelConfig, observations: Array, goals: Array, demonstrated: Array, mask: Array
 ) -> Array:
-    """The outer loss of a batch."""
+    """Outer loss of a batch."""
     if model.sees_goal:
         x, goal = jnp.split(encode(weights, model, jnp.concatenate([observations, goals])), 2)
     else:
@@ -50,14 +50,14 @@ def gather(data: Mapping[str, Array], row: int) -> tuple[Array, Array, Array, Ar
 def train_step(
     weights: Weights, state: optax.OptState, model: ModelConfig, data: Mapping[str, Array], row: int
 ) -> tuple[optax.Params, optax.OptState, Array]:
-    """Takes a step on the batch of this row."""
+    """Training step on the batch of index `row`."""
     loss, gradients = jax.value_and_grad(outer_loss)(weights, model, *gather(data, row))
     updates, state = OPTIMIZER.update(gradients, state, weights)
     return optax.apply_updates(weights, updates), state, loss
 
 
 class Trainer:
-    """The weights with the state of their optimiser, and the batches."""
+    """Weights with their optimiser state, and the batches."""
 
     def __init__(self, batches: Batches) -> None:
         self.model, self.count = batches.model, len(batches)
@@ -66,14 +66,14 @@ class Trainer:
         self.state = OPTIMIZER.init(self.weights)
 
     def step(self, number: int) -> Callable[[], float]:
-        """Takes a training step."""
+        """Starts a training step."""
         row = number % self.count
         self.weights, self.state, loss = train_step(self.weights, self.state, self.model, self.data, row)
         return loss.item
 
 
 def main(batches: Path, method: str, threads: int) -> None:
-    """Trains as asked on stdin."""
+    """Trains on request on standard input."""
     check_cores(threads)
     serve(Trainer(Batches.read(batches, method)))
 

@@ -1,10 +1,10 @@
-"""The methods in PyTorch, eager or compiled, written as its documentation would have them.
+"""Training in PyTorch, eager or compiled, in the style of its documentation.
 
-Tried for CPN at the paper's sizes, batch 128, one thread (per second of CPU time, medians of 6 to 8 interleaved turns
-on a busy machine). With glibc told to keep freed memory, the gated product as `baddbmm` gives 628 samples/s; as a
-weighted sum 1.21 times that; with channels last too 1.25 times, which is what stands here. With glibc as it comes
-`matmul`, `einsum`, `baddbmm` and the sum lie within 11 %; to `matmul` the memory setting gave 9 %, huge pages 2 %, and
-the `foreach` Adam instead of the fused one 5 %, which was about the noise.
+Alternatives, measured for CPN at the paper's sizes, batch 128, one thread (per second of CPU time, medians of 6 to 8
+interleaved turns on a busy machine). With glibc told to keep freed memory, the gated product as `baddbmm` gives 628
+samples/s; as a weighted sum 1.21 times that; with channels last too, as implemented here, 1.25 times. With glibc's
+defaults `matmul`, `einsum`, `baddbmm` and the sum lie within 11 %; to `matmul` the memory setting gave 9 %, huge pages
+2 %, and the `foreach` Adam instead of the fused one 5 %, which was about the noise.
 
 `torch.compile` cannot differentiate its graphs twice, but it traces through `torch.func.grad`: one graph (`fullgraph`)
 holds the forward pass and the inner gradient, and the outer gradient is derived from it. That gives 1.28 times;
@@ -24,13 +24,13 @@ from cpn_bench.train.contender import LEARNING_RATE, MAX_GRADIENT_NORM, serve
 
 
 class Learner(Agent):
-    """A method whose forward pass is the outer loss."""
+    """Agent with the outer loss as its forward pass."""
 
     in_bfloat16 = False
-    """Whether the encoder computes in it."""
+    """True if the encoder computes in bfloat16."""
 
     def forward(self, observations: Tensor, goals: Tensor, demonstrated: Tensor, mask: Tensor) -> Tensor:
-        """The outer loss of a batch."""
+        """Outer loss of a batch."""
         if self.model.sees_goal:
             x, goal = self.embed(torch.cat([observations, goals])).chunk(2)
         else:
@@ -40,26 +40,26 @@ class Learner(Agent):
         return squared.sum() / (mask.sum() * demonstrated.shape[-1])
 
     def embed(self, images: Tensor) -> Tensor:
-        """`[B, 84, 84, 3]` bytes to `[B, Z]`."""
+        """Embeddings `[B, Z]` of images `[B, 84, 84, 3]`, bytes."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.in_bfloat16):
             return self.encoder(images).to(self.step_size.dtype)
 
     def plan(self, x: Tensor, goal: Tensor) -> Tensor:
-        """The policy's rollout, improved by gradient descent on the predicted distance to the goal."""
+        """Planned actions: the policy's rollout with gradient updates on the inner loss."""
         actions = self.rollout(x, goal)
         for _ in range(self.model.updates):
             actions = actions - self.step_size * self.inner_gradient(actions, x, goal)
         return actions
 
     def inner_gradient(self, actions: Tensor, x: Tensor, goal: Tensor) -> Tensor:
-        """The gradient of the inner loss in the actions, differentiable itself."""
+        """Gradient of the inner loss in the actions, itself differentiable."""
         if torch.compiler.is_compiling():
             return torch.func.grad(self.inner_loss)(actions, x, goal)
         return torch.autograd.grad(self.inner_loss(actions, x, goal), actions, create_graph=True)[0]
 
 
 class Trainer:
-    """An agent with its optimiser and its batches."""
+    """Agent with its optimiser and its batches."""
 
     def __init__(self, batches: Batches, compiled: bool = False, bfloat16: bool = False, device: str = "cpu") -> None:
         self.data = {name: tensor.to(device) for name, tensor in tensors(batches.arrays).items()}
@@ -70,9 +70,9 @@ class Trainer:
         self.outer_loss = torch.compile(self.agent, fullgraph=True) if compiled else self.agent
 
     def step(self, number: int) -> Callable[[], float]:
-        """Takes a training step."""
+        """Starts a training step."""
         self.optimizer.zero_grad()
-        # The first loss is compared with others', in float32.
+        # The first loss is compared with the other contenders', in float32.
         self.agent.in_bfloat16 = self.bfloat16 and number > 0
         loss = self.outer_loss(*self.batch(number))
         loss.backward()
@@ -96,7 +96,7 @@ def main(
     bfloat16: bool = False,
     device: str = "cpu",
 ) -> None:
-    """Trains as asked on stdin."""
+    """Trains on request on standard input."""
     torch.set_num_threads(threads)
     serve(Trainer(Batches.read(batches, method), compiled=compile, bfloat16=bfloat16, device=device))
 

@@ -1,8 +1,8 @@
-//! The matrix product c = a b, by a kernel whose sums do not depend on the number of rows: each number of a product is summed
-//! along the inner dimension in order, so that a row comes out the same, bit for bit, alone or among others.
+//! The matrix product c = a b. Every element of c is summed along the inner dimension in order, so that a row of c is bit for bit
+//! independent of the other rows.
 //!
-//! What the kernel keeps in registers is filled in loops of fixed length over slices of fixed length: closures and iterators
-//! in their place send it through memory.
+//! Arrays in registers are filled in loops of constant length over slices of constant length: with closures and iterators the
+//! compiler spills them to memory.
 
 use super::packing::{BLayout, NR_VECTORS, WIDE_NR_VECTORS};
 use crate::engine::simd::element::{Element, Operand};
@@ -10,11 +10,11 @@ use crate::engine::simd::vector::{Vector, VectorShape};
 use pulp::{Simd, WithSimd};
 use std::ops::Range;
 
-/// Numbers of the largest tile: eight rows of a panel.
+/// Size of the largest tile, eight rows of a panel, in elements.
 const TILE: usize = 8 * WIDE_NR_VECTORS * 16;
-/// Numbers of a single row that are scanned at once for zeros.
+/// Length of the chunks of a single row that are scanned for zeros.
 const CHUNK: usize = 256;
-/// Size of b in operands below which it is read faster than a row is scanned.
+/// Minimum size of b, in operands, for which scanning a row for zeros is worthwhile.
 const SMALL: usize = 1 << 14;
 
 /// The product c = a b, `[rows, columns]`; with `accumulate` c += a b.
@@ -36,16 +36,16 @@ struct Gemm<'a, E: Operand> {
 /// The left-hand side a of a product.
 #[derive(Debug, Clone, Copy)]
 pub enum Lhs<'a, E> {
-    /// a as it is, `[rows, inner]`.
+    /// a, `[rows, inner]`.
     Rows(&'a [E]),
     /// aᵀ, `[inner, rows]`.
     Transposed(&'a [E]),
 }
 
-/// Sums of a tile in registers: of R rows, at P panels of W vectors.
+/// Sums of a tile in registers: R rows, P panels of W vectors.
 type TileSums<S, T, const R: usize, const P: usize, const W: usize> = [[[Vector<S, T>; W]; P]; R];
 
-/// An index along the inner dimension, with b's numbers there from the beginning of each of P panels on.
+/// An index k along the inner dimension, with the values of b from row k of each of P panels on.
 type KIndex<'a, E, const P: usize> = (usize, [&'a [E]; P]);
 
 impl<E: Operand> Gemm<'_, E> {
@@ -60,9 +60,9 @@ impl<E: Operand> Gemm<'_, E> {
         }
     }
 
-    /// All rows, by panels of W vectors.
+    /// All rows, in panels of W vectors.
     fn all_rows<const W: usize>(&mut self) {
-        // As many rows at once as there are registers for their sums, a part of b and a number of a.
+        // As many rows at once as the registers hold sums for, besides vectors of b and an element of a.
         let mut row = 0;
         if VectorShape::of::<E>().registers >= 32 {
             row = self.row_tiles::<8, W>(row);
@@ -84,9 +84,9 @@ impl<E: Operand> Gemm<'_, E> {
         end
     }
 
-    /// A tile of c, R rows at P panels: the contribution of some indices along the inner dimension, as the `first` or added to
-    /// c. The indices are those of full rows of b, and those where b may end within a register. `workspace` is for a tile that
-    /// overruns c's right edge.
+    /// The contribution of indices along the inner dimension to a tile of c, R rows and P panels; `first` replaces c, else it is
+    /// added. The indices come in two parts: full rows of b, and rows where b may end within a register. `workspace` holds a tile
+    /// that overruns c's right edge.
     #[inline(always)]
     fn tile<'a, S: Simd, const R: usize, const P: usize, const W: usize>(
         &mut self,
@@ -139,7 +139,7 @@ impl<E: Operand> Gemm<'_, E> {
     }
 }
 
-/// The kernel over R rows at a time.
+/// Kernel for tiles of R rows.
 #[derive(Debug)]
 struct RowTiles<'a, 'b, E: Operand, const R: usize, const W: usize> {
     gemm: &'a mut Gemm<'b, E>,
@@ -170,8 +170,8 @@ impl<E: Operand, const R: usize, const W: usize> WithSimd for RowTiles<'_, '_, E
     }
 }
 
-/// The kernel over a row by itself, which is bound by reading b; where a is an activation after a rectified linear unit, rows of
-/// b that meet its zeros are skipped.
+/// Kernel for a single row, limited by the bandwidth of reading b: rows of b at zeros of a, frequent after a rectified linear unit,
+/// are skipped.
 #[derive(Debug)]
 struct SingleRow<'a, 'b, E: Operand> {
     gemm: &'a mut Gemm<'b, E>,
@@ -207,7 +207,7 @@ impl<E: Operand> WithSimd for SingleRow<'_, '_, E> {
 }
 
 impl<E: Operand> SingleRow<'_, '_, E> {
-    /// All panels, several at once, so that no sum waits for the one before.
+    /// All panels, several at once, so that their sums are independent in the processor's pipeline.
     #[inline(always)]
     fn panels<S: Simd>(
         &mut self,
@@ -231,7 +231,7 @@ impl<E: Operand> SingleRow<'_, '_, E> {
         }
     }
 
-    /// The micro-kernel of a row at P panels, from `panel` on.
+    /// Micro-kernel of a row at P panels, from `panel` on.
     #[inline(always)]
     fn micro_kernel<S: Simd, const P: usize>(
         &mut self,
@@ -246,6 +246,7 @@ impl<E: Operand> SingleRow<'_, '_, E> {
         for (p, values) in panels.iter_mut().enumerate() {
             *values = b.panel(panel + p, NR_VECTORS * Vector::<S, E::Sum>::COUNT);
         }
+
         let lines = |k: usize| {
             let mut lines = panels;
             for line in &mut lines {
@@ -263,13 +264,13 @@ impl<E: Operand> SingleRow<'_, '_, E> {
     }
 }
 
-/// Workspace of a tile that overruns the right edge, if one can: to fill it with zeros takes its time.
+/// Workspace of a tile that overruns the right edge; `None` if no tile does, since zeroing it takes time.
 #[inline(always)]
 fn edge_tile<T: Element>(columns: usize, width: usize) -> Option<[T; TILE]> {
     if columns.is_multiple_of(width) { None } else { Some([T::ZERO; TILE]) }
 }
 
-/// Sums plus the contribution of some indices along the inner dimension, for R rows of a from `row` on of `count`.
+/// Sums plus the contribution of indices along the inner dimension, for R of a's `count` rows, from `row` on.
 #[inline(always)]
 fn accumulate_lhs<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: usize>(
     simd: S,
@@ -296,8 +297,7 @@ fn accumulate_lhs<'a, S: Simd, E: Operand, const R: usize, const P: usize, const
     }
 }
 
-/// Sums plus, for each index k, R numbers of a, `a(r, k)`, times P panels of b, whose rows may end within a register unless they
-/// are FULL.
+/// Sums plus, for each index k, R elements of a, `a(r, k)`, times P panels of b. Unless FULL, b's rows may end within a register.
 #[inline(always)]
 fn accumulate<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: usize, const FULL: bool>(
     simd: S,
@@ -316,6 +316,7 @@ fn accumulate<'a, S: Simd, E: Operand, const R: usize, const P: usize, const W: 
             for (i, b) in b.iter_mut().enumerate() {
                 *b = E::load(simd, part(i));
             }
+
             for (r, sums) in sums.iter_mut().enumerate() {
                 let a = E::splat(simd, a(r, k));
                 for (sum, b) in sums[p].iter_mut().zip(b) {
@@ -334,7 +335,7 @@ mod tests {
     use crate::engine::simd::bf16::Bf16x2;
     use crate::engine::simd::buffer::zeros;
 
-    /// Numbers from -1 to 1, none of which fits bfloat16.
+    /// Numbers from -1 to 1, none exact in bfloat16.
     fn numbers(count: usize, seed: usize) -> Vec<f32> {
         (0..count).map(|i| ((i * 7919 + seed * 104_729) % 9973) as f32 / 4986.5 - 1.0001).collect()
     }
@@ -365,7 +366,7 @@ mod tests {
         }
     }
 
-    /// All four ways to call it, once written and once accumulated.
+    /// All four combinations of layouts, overwritten and accumulated.
     fn check<T: Element + Into<f64>>(a: &[T], b: &[T], columns: usize, tolerance: f64) {
         let inner = b.len() / columns;
         let rows = a.len() / inner;
@@ -386,8 +387,7 @@ mod tests {
         }
     }
 
-    /// Every number of rows that the kernel takes apart differently, and every remainder of columns and inner indices: panels are
-    /// up to 48 columns wide.
+    /// All divisions of rows into tiles, and all remainders of columns and inner indices: panels are up to 48 columns wide.
     #[test]
     fn all_tails_agree_with_a_naive_product() {
         for rows in 1..=17 {
@@ -412,9 +412,9 @@ mod tests {
         }
     }
 
-    /// So large a b that a single row is scanned for zeros, in several chunks, the last of them short.
+    /// b is large enough that a single row is scanned for zeros, in several chunks, the last one short.
     #[test]
-    fn a_sparse_row_skips_no_number() {
+    fn a_sparse_row_skips_only_zeros() {
         for (inner, columns) in [(600, 33), (257, 70), (512, 32), (300, 130)] {
             let mut a = numbers(inner, 1);
             a.iter_mut().enumerate().filter(|(k, _)| k % 3 != 0 || (256..300).contains(k)).for_each(|(_, a)| *a = 0.0);
@@ -422,9 +422,8 @@ mod tests {
         }
     }
 
-    /// In every bit.
     #[test]
-    fn a_row_does_not_depend_on_its_company() {
+    fn a_row_is_bitwise_independent_of_other_rows() {
         for (inner, columns) in [(37, 19), (300, 70), (512, 64)] {
             let (a, b) = (numbers(23 * inner, 1), numbers(inner * columns, 2));
             let b_t = transposed(&b, columns);

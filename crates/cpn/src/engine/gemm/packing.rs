@@ -1,36 +1,36 @@
-//! Layouts of the right-hand side b of a [product](super::kernel): row by row, or packed panel by panel.
+//! Layouts of the right-hand side b of a [product](super::kernel): row-major, or packed in panels.
 
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Operand;
 use crate::engine::simd::vector::VectorShape;
 
-/// NR of a panel, in vectors.
+/// Width of a panel (NR), in vectors.
 pub const NR_VECTORS: usize = 2;
-/// NR in vectors where three leave less of the last panel empty, and there are enough registers.
+/// Width of wide panels, in vectors: for processors with enough registers, where they leave less of the last panel empty.
 pub const WIDE_NR_VECTORS: usize = 3;
 
-/// View of b, `[inner, columns]`, in panels of as many columns as fill [`Self::nr_vectors`].
+/// View of b, `[inner, columns]`, in panels of [`Self::nr_vectors`] vectors.
 #[derive(Debug, Clone, Copy)]
 pub struct BLayout<'a, E> {
-    /// The numbers, row by row or panel by panel.
+    /// The values, row-major or panel by panel.
     pub values: &'a [E],
     /// Rows of b.
     pub inner: usize,
     /// Columns of b.
     pub columns: usize,
-    /// Distance from a row of a panel to the next.
+    /// Distance between the rows of a panel, in values.
     pub stride: usize,
-    /// Width of a panel in vectors.
+    /// Width of a panel, in vectors.
     pub nr_vectors: usize,
-    /// True if the values lie panel by panel, false if row by row.
+    /// True for the packed layout, false for row-major.
     pub packed: bool,
-    /// Number of leading rows whose panels may all be read to their full width, into the next row or not; past b's end there
-    /// may be nothing to fill the registers with.
+    /// Number of leading rows whose panels may be loaded at full width, even into the next row; the others would overrun the end
+    /// of b.
     pub full_rows: usize,
 }
 
 impl<'a, E: Operand> BLayout<'a, E> {
-    /// The layout row by row, `[inner, columns]`.
+    /// Row-major layout of `[inner, columns]`.
     pub fn new(values: &'a [E], columns: usize) -> Self {
         let (inner, shape) = (values.len() / columns, VectorShape::of::<E>());
 
@@ -39,20 +39,20 @@ impl<'a, E: Operand> BLayout<'a, E> {
         let is_wide = shape.registers >= 32 && end(WIDE_NR_VECTORS) < end(NR_VECTORS);
         let nr_vectors = if is_wide { WIDE_NR_VECTORS } else { NR_VECTORS };
 
-        // A row by itself takes panels of the fewer registers all the same, which end behind the others.
+        // Single rows always use the narrow panels, whose last one may end further to the right.
         let overrun_rows = (end(NR_VECTORS) - columns).div_ceil(columns);
         let full_rows = if columns < nr_vectors * shape.lanes { 0 } else { inner.saturating_sub(overrun_rows) };
         Self { values, inner, columns, stride: columns, nr_vectors, packed: false, full_rows }
     }
 
-    /// The values from the beginning of a panel on, for panels of `width` columns.
+    /// The values from the beginning of a panel of `width` columns on.
     #[inline(always)]
     pub fn panel(&self, panel: usize, width: usize) -> &'a [E] {
         &self.values[panel * if self.packed { self.inner * self.stride } else { width }..]
     }
 }
 
-/// Packed b: panel by panel, so that products read it from one end to the other; the last panel is filled up with zeros.
+/// b packed in panels, which products read sequentially; the last panel is padded with zeros.
 #[derive(Debug)]
 pub struct PackedB<E> {
     values: AlignedVec<E>,
@@ -66,7 +66,7 @@ impl<E: Operand> PackedB<E> {
         let (columns, width) = (values.len() / inner, Self::width());
         let mut panels = zeros(inner * columns.next_multiple_of(width));
         for (panel, rows) in panels.chunks_exact_mut(inner * width).zip(values.chunks(inner * width)) {
-            // Written from one end to the other; what is read lies in no more lines than a panel has columns.
+            // Written sequentially, and read from as many cache lines as a panel has columns.
             let rows: Vec<_> = rows.chunks_exact(inner).collect();
             for (k, line) in panel.chunks_exact_mut(width).enumerate() {
                 for (value, row) in line.iter_mut().zip(&rows) {
@@ -77,7 +77,7 @@ impl<E: Operand> PackedB<E> {
         Self { values: panels, inner, columns }
     }
 
-    /// Columns of a panel.
+    /// Number of columns of a panel.
     fn width() -> usize {
         NR_VECTORS * VectorShape::of::<E>().lanes
     }

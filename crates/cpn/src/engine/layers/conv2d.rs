@@ -1,4 +1,4 @@
-//! A convolution of the encoder with the rectified linear unit behind it.
+//! Convolution of the encoder, followed by a rectified linear unit.
 
 use super::conv2d_params::Conv2dParams;
 use super::linear::{Linear, LinearGradient};
@@ -9,7 +9,7 @@ use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
 use crate::engine::simd::element::Element;
 use crate::precision::Precision;
 
-/// A convolution over images whose channels lie together, `[S, S, C]` to `[S', S', O]`.
+/// A convolution with a rectified linear unit, from `[S, S, C]` to `[S', S', O]`, channels last.
 #[derive(Debug)]
 pub struct Conv2d<T: Element> {
     algorithm: Algorithm<T>,
@@ -26,12 +26,12 @@ enum Algorithm<T: Element> {
     Im2col(Im2col<T>),
 }
 
-/// A linear layer over copied patches of the image, for kernels that minimal filtering does not suit.
+/// A linear layer over copied patches of the image, for kernels that minimal filtering does not support.
 #[derive(Debug)]
 struct Im2col<T> {
-    /// Beginning of each patch in an image, `[S' S']`.
+    /// Index of each patch's first element in an image, `[S' S']`.
     starts: Vec<usize>,
-    /// Offsets of a patch's numbers from its beginning, `[K K C]`.
+    /// Offsets of a patch's elements from its first, `[K K C]`.
     offsets: Vec<usize>,
     /// C.
     channels: usize,
@@ -39,7 +39,7 @@ struct Im2col<T> {
     linear: Linear<T>,
 }
 
-/// Workspace for intermediates between images and outputs, kept from layer to layer.
+/// Workspace for intermediates between images and outputs, shared by the layers.
 #[derive(Debug)]
 pub struct Conv2dWorkspace<T: Element> {
     winograd: WinogradWorkspace<T>,
@@ -49,14 +49,15 @@ pub struct Conv2dWorkspace<T: Element> {
 }
 
 impl<T: Element> Conv2dWorkspace<T> {
-    /// An empty workspace; it grows.
+    /// An empty workspace, which grows on use.
     pub fn new() -> Self {
         Self { winograd: WinogradWorkspace::new(), half_winograd: WinogradWorkspace::new(), patches: zeros(0) }
     }
 }
 
 impl<T: Element> Conv2d<T> {
-    /// A convolution of `weight`, `[O, C, K, K]`, and `bias`, `[O]`; patches are always in full precision.
+    /// A convolution of `weight`, `[O, C, K, K]`, and `bias`, `[O]`. Precision applies to minimal filtering; patches are always in
+    /// full precision.
     pub fn new(params: Conv2dParams, weight: &[T], bias: &[T], precision: Precision) -> Self {
         let size = params.output_side();
         let half = (precision == Precision::Bfloat16).then(|| Winograd::new(params, weight, bias)).flatten();
@@ -68,7 +69,7 @@ impl<T: Element> Conv2d<T> {
         Self { algorithm, inputs, outputs: size * size * bias.len() }
     }
 
-    /// y `[R, S', S', O]` of images x `[R, S, S, C]`, with [`PADDING`](super::winograd_transform::PADDING) behind them.
+    /// y `[R, S', S', O]` of images x `[R, S, S, C]`, followed by [`PADDING`](super::winograd_transform::PADDING).
     pub fn forward(&self, x: &[T], y: &mut [T], workspace: &mut Conv2dWorkspace<T>) {
         match &self.algorithm {
             Algorithm::Winograd(winograd) => winograd.forward(x, y, &mut workspace.winograd),
@@ -82,8 +83,8 @@ impl<T: Element> Conv2d<T> {
         }
     }
 
-    /// The first-order backward pass from ŷ, a gradient before the unit: adds to the weights' gradient, and writes x̂ if there is
-    /// a buffer for it.
+    /// First-order backward pass from ŷ, the gradient before the rectified linear unit: adds to the weights' gradient, and writes
+    /// x̂ if given.
     pub fn vjp(
         &self,
         x: &[T],
@@ -104,7 +105,7 @@ impl<T: Element> Conv2d<T> {
         }
     }
 
-    /// A gradient of zeros, in the linear layers that the convolution is made of.
+    /// A zero gradient, one for each linear layer of the algorithm.
     pub fn gradient(&self) -> Vec<LinearGradient<T>> {
         match &self.algorithm {
             Algorithm::Winograd(winograd) => winograd.gradient(),
@@ -170,7 +171,7 @@ impl<T: Element> Im2col<T> {
     }
 }
 
-/// Matrices `[C, P]`, one after the other, transposed to `[P, C]`.
+/// Transposes consecutive matrices `[C, P]` to `[P, C]`.
 pub fn transpose<T: Element>(matrices: &[T], channels: usize, positions: usize) -> Vec<T> {
     let mut transposed = Vec::with_capacity(matrices.len());
     for matrix in matrices.chunks_exact(channels * positions) {
@@ -191,7 +192,7 @@ mod tests {
         (0..count).map(|i| ((i * 7919 + seed * 104_729) % 9973) as f64 / 4986.5 - 1.0).collect()
     }
 
-    /// A convolution by its definition, with the sizes of its operands.
+    /// A reference convolution by its definition, with its operands.
     struct Naive {
         params: Conv2dParams,
         images: usize,
@@ -210,7 +211,7 @@ mod tests {
             Self { params, images, outputs, x, weight, bias: numbers(outputs, 3) }
         }
 
-        /// Every product of the convolution: places in y, x and the weight.
+        /// All products of the convolution: indices in y, x and the weight.
         fn products(&self) -> impl Iterator<Item = (usize, usize, usize)> {
             let (Conv2dParams { side, channels, kernel, stride }, size) = (self.params, self.params.output_side());
             let (images, outputs) = (self.images, self.outputs);
@@ -226,7 +227,7 @@ mod tests {
             })
         }
 
-        /// y before the unit.
+        /// y before the rectified linear unit.
         fn forward(&self) -> Vec<f64> {
             let size = self.params.output_side();
             let mut y: Vec<f64> = (0..self.images * size * size).flat_map(|_| self.bias.iter().copied()).collect();
@@ -234,7 +235,7 @@ mod tests {
             y
         }
 
-        /// x̂, and the gradients in weight and bias, of ŷ before the unit.
+        /// x̂, and the gradients in weight and bias, of ŷ before the rectified linear unit.
         fn vjp(&self, y_hat: &[f64]) -> [Vec<f64>; 3] {
             let mut x_hat = vec![0.0; self.x.len() - PADDING];
             let mut weight = vec![0.0; self.weight.len()];
@@ -268,7 +269,7 @@ mod tests {
         let mut y = vec![T::from_f64(f64::NAN); expected.len()];
         let y_hat = numbers(y.len(), 4);
         let [x_hat, weight, bias] = naive.vjp(&y_hat);
-        // Again, from what the passes before left in the workspace.
+        // Twice, the second time with a used workspace.
         for _ in 0..2 {
             conv.forward(&x, &mut y, &mut workspace);
             assert_close(&wide(&y), &expected, tolerance, &what);
@@ -291,8 +292,8 @@ mod tests {
         }
     }
 
-    /// Sizes (side, channels, kernel, stride) that minimal filtering suits, of outputs that are a multiple of 16: both numbers of
-    /// taps, images that end with a tile, within one, or with pixels that no kernel sees.
+    /// Sizes (side, channels, kernel, stride) supported by minimal filtering, with a multiple of 16 outputs: both numbers of taps,
+    /// and images that end with a tile, within one, or with pixels outside all kernels.
     #[test]
     fn minimal_filtering_agrees_with_the_definition() {
         for (side, channels, kernel, stride) in [

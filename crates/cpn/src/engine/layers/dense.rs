@@ -1,4 +1,4 @@
-//! A layer of g_θ, plain or neuromodulated, and its four passes over a block of R samples.
+//! Fully connected layer of g_θ, plain or neuromodulated, and its four passes over a block of R samples.
 
 use super::linear::{Linear, LinearGradient, Weights};
 use super::passes::{Order, Stacked};
@@ -7,7 +7,7 @@ use crate::engine::layers::neuromodulated::layer::{Neuromodulated, Neuromodulate
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 
-/// Tapes and gradients are made by the layer that they are used with.
+/// Text of the panic for a tape or a gradient of another layer.
 const MISMATCH: &str = "a layer is plain or neuromodulated, and so are its tape and its gradient";
 
 /// y = a x + b, or y = (u(x) ⊙ a) x + v(x) ⊙ b.
@@ -24,7 +24,7 @@ pub enum DenseGradient<T> {
     Neuromodulated(Box<NeuromodulatedGradient<T>>),
 }
 
-/// Tape of a layer: arguments of its passes, and intermediates that they leave for each other.
+/// Tape of a layer: arguments of its passes, and intermediates for later passes.
 #[derive(Debug)]
 pub struct LayerTape<T> {
     inputs: usize,
@@ -70,8 +70,7 @@ impl<T: Element> DenseGradient<T> {
 }
 
 impl<T: Element> Dense<T> {
-    /// The layer of a name in a checkpoint. The first `rectified` of its inputs are outputs of a rectified linear unit, none if
-    /// that is 0.
+    /// The layer of a name in a checkpoint. The first `rectified` of its inputs are outputs of a rectified linear unit.
     pub fn named(name: &str, rectified: usize, weights: &impl Weights<T>, is_neuromodulated: bool) -> Self {
         if is_neuromodulated {
             Self::Neuromodulated(Box::new(Neuromodulated::named(name, rectified, weights)))
@@ -80,7 +79,7 @@ impl<T: Element> Dense<T> {
         }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> DenseGradient<T> {
         match self {
             Self::Plain(linear) => DenseGradient::Plain(linear.gradient()),
@@ -88,7 +87,7 @@ impl<T: Element> Dense<T> {
         }
     }
 
-    /// A gradient by the names of the weights.
+    /// A gradient by the weights' names in a checkpoint.
     pub fn in_weights(&self, name: &str, gradient: &DenseGradient<T>) -> Vec<(String, Vec<T>)> {
         match (self, gradient) {
             (Self::Plain(_), DenseGradient::Plain(gradient)) => gradient.in_weights(name),
@@ -116,7 +115,7 @@ impl<T: Element> Dense<T> {
         }
     }
 
-    /// The gradient in the inputs of the tape's ȳ, added to x̄ `[R, inputs]`.
+    /// Adds the gradient in the inputs, of the tape's ȳ, to x̄ `[R, inputs]`.
     pub fn vjp(&self, rows: usize, tape: &mut LayerTape<T>, scratch: &mut Scratch<T>, x_bar: &mut [T]) {
         let (x, y_bar) = (&tape.x[..rows * tape.inputs], &tape.y[rows * tape.outputs..2 * rows * tape.outputs]);
         match (self, &mut tape.gates) {
@@ -136,8 +135,8 @@ impl<T: Element> Dense<T> {
         }
     }
 
-    /// The gradient of Φ in inputs and weights, from the tape's ŷ and, in the second order, its ẋ and ȳ: added to x̂
-    /// `[R, inputs]` and to `gradient`.
+    /// Adds the gradient of Φ in inputs and weights, from the tape's ŷ and, in the second order, its ẋ and ȳ, to x̂ `[R, inputs]`
+    /// and `gradient`.
     pub fn double_backward(
         &self,
         rows: usize,

@@ -7,7 +7,7 @@ use crate::engine::simd::element::Element;
 /// ε, added to the variance, as in libtorch.
 const EPSILON: f64 = 1e-5;
 
-/// Layer normalisation of rows `[Z]`: less their mean, by their standard deviation, then scaled and shifted.
+/// Layer normalisation of rows `[Z]`: (x - mean) / sqrt(variance + ε) · weight + bias.
 #[derive(Debug)]
 pub struct LayerNorm<T> {
     weight: Vec<T>,
@@ -30,12 +30,12 @@ impl<T: Element> LayerNorm<T> {
         x.chunks_exact(self.weight.len()).flat_map(normalise).collect()
     }
 
-    /// The first-order backward pass, in place: `hat` is ŷ `[R, Z]` before and x̂ after; adds to the weights' gradient.
+    /// First-order backward pass, in place: replaces ŷ `[R, Z]` in `hat` by x̂, and adds to the weights' gradient.
     pub fn vjp(&self, x: &[T], hat: &mut [T], gradient: &mut LinearGradient<T>) {
         let latent = self.weight.len();
         let count = T::count(latent);
         for (x, hat) in x.chunks_exact(latent).zip(hat.chunks_exact_mut(latent)) {
-            // Through scale and shift.
+            // Backward through weight and bias.
             let (mean, scale) = moments(x);
             let normal = |i: usize| (x[i] - mean) * scale;
             for (i, hat) in hat.iter_mut().enumerate() {
@@ -44,7 +44,7 @@ impl<T: Element> LayerNorm<T> {
                 *hat = *hat * self.weight[i];
             }
 
-            // Through the normalisation: neither a shift nor a stretch of x changes anything.
+            // Backward through the normalisation, which is invariant to shift and scale of x.
             let shift = hat.iter().copied().sum::<T>() / count;
             let stretch = hat.iter().enumerate().map(|(i, hat)| *hat * normal(i)).sum::<T>() / count;
             for (i, hat) in hat.iter_mut().enumerate() {
@@ -53,13 +53,13 @@ impl<T: Element> LayerNorm<T> {
         }
     }
 
-    /// A gradient of zeros, `[Z]` both.
+    /// A zero gradient, weight and bias `[Z]`.
     pub fn gradient(&self) -> LinearGradient<T> {
         LinearGradient { weight: zeros(self.weight.len()), bias: zeros(self.bias.len()) }
     }
 }
 
-/// A row's mean, and 1 by its standard deviation.
+/// A row's mean, and 1 / sqrt(variance + ε).
 fn moments<T: Element>(x: &[T]) -> (T, T) {
     let count = T::count(x.len());
     let mean = x.iter().copied().sum::<T>() / count;
@@ -83,9 +83,11 @@ mod tests {
             let norm = LayerNorm { weight: weight.to_vec(), bias: bias.to_vec() };
             norm.forward(x).iter().zip(&y_hat).map(|(y, y_hat)| y * y_hat).sum::<f64>()
         };
+
         let norm = LayerNorm { weight: weight.clone(), bias: bias.clone() };
         let (mut x_hat, mut gradient) = (y_hat.clone(), norm.gradient());
         norm.vjp(&x, &mut x_hat, &mut gradient);
+
         let moved = |values: &[f64], i: usize, by: f64| {
             let mut values = values.to_vec();
             values[i] += by;
@@ -95,6 +97,7 @@ mod tests {
             let expected = (f(1e-5) - f(-1e-5)) / 2e-5;
             assert!((ours - expected).abs() < 1e-7 * (1.0 + expected.abs()), "{ours} for {expected}");
         };
+
         for (i, x_hat) in x_hat.iter().enumerate() {
             check(*x_hat, &|by| loss(&weight, &bias, &moved(&x, i, by)));
         }

@@ -1,4 +1,4 @@
-//! The fully connected layer y = a x + b, and its passes, which those of all other layers are made of.
+//! Fully connected layer y = a x + b, with the passes that all other layers build on.
 
 use super::passes::Stacked;
 use crate::engine::gemm::kernel::{Lhs, gemm};
@@ -7,23 +7,23 @@ use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::{Element, Operand};
 use crate::engine::simd::vector::add;
 
-/// Weights by their names in a checkpoint.
+/// Source of weights, by name in a checkpoint.
 pub trait Weights<T> {
-    /// The weight of a name, row by row.
+    /// The weight of a name, in row-major order.
     ///
     /// # Panics
-    /// If there is none of this name.
+    /// If the name is unknown.
     fn get(&self, name: &str) -> Vec<T>;
 }
 
-/// A layer's weights as operands E of its products, which T accumulates: where an operand packs two numbers, both sizes are even.
+/// A layer's weights as operands E of its products, accumulated in T. `inputs` and `outputs` are multiples of E's PACK.
 #[derive(Debug)]
 pub struct Linear<E, T = E> {
     pub inputs: usize,
     pub outputs: usize,
     /// a, `[outputs, inputs]`, packed across its rows.
     weight: AlignedVec<E>,
-    /// aᵀ, `[inputs, outputs]`, packed along a's rows: each product reads the one whose rows it runs along.
+    /// aᵀ, `[inputs, outputs]`, packed along a's rows. Each product reads the layout that is contiguous in its direction.
     transposed: PackedB<E>,
     /// b, `[outputs]`.
     bias: Vec<T>,
@@ -39,7 +39,7 @@ pub struct LinearGradient<T> {
 }
 
 impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
-    /// A layer of a `[outputs, inputs]` and b `[outputs]`.
+    /// A layer of weight a, `[outputs, inputs]`, and bias b, `[outputs]`.
     pub fn new(weight: &[T], bias: Vec<T>) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
         let mut workspace = zeros(0);
@@ -48,7 +48,7 @@ impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
         Self { inputs, outputs, weight, transposed, bias }
     }
 
-    /// y = a x + b: x `[R, inputs]`, packed along its rows, to y `[R, outputs]`.
+    /// y = a x + b, `[R, outputs]`, of x `[R, inputs]`, packed along its rows.
     pub fn forward(&self, x: &[E], y: &mut [T]) {
         for row in y.chunks_exact_mut(self.outputs) {
             row.copy_from_slice(&self.bias);
@@ -76,7 +76,7 @@ impl<T: Element, E: Operand<Sum = T>> Linear<E, T> {
         gemm(true, &mut gradient.weight, Lhs::Transposed(stacked.y), BLayout::new(stacked.x, self.inputs));
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> LinearGradient<T> {
         LinearGradient { weight: zeros(self.outputs * self.inputs), bias: zeros(self.outputs) }
     }
@@ -88,7 +88,7 @@ impl<T: Element> Linear<T> {
         Self::new(&weights.get(&format!("{name}.weight")), weights.get(&format!("{name}.bias")))
     }
 
-    /// [`Self::accumulate`], and ∂Φ/∂b, from ŷ, the first R = `rows` of the stacked rows.
+    /// [`Self::accumulate`], and ∂Φ/∂b from ŷ, the first R = `rows` of the stacked rows.
     pub fn accumulate_all(&self, rows: usize, stacked: Stacked<'_, T>, gradient: &mut LinearGradient<T>) {
         self.accumulate(stacked, gradient);
         gradient.add_bias(&stacked.y[..rows * self.outputs]);
@@ -109,7 +109,7 @@ impl<T: Element> LinearGradient<T> {
         add(&mut self.bias, &other.bias);
     }
 
-    /// The gradient by the names of the weights.
+    /// The gradient by the weights' names in a checkpoint.
     pub fn in_weights(&self, name: &str) -> Vec<(String, Vec<T>)> {
         vec![(format!("{name}.weight"), self.weight.to_vec()), (format!("{name}.bias"), self.bias.to_vec())]
     }

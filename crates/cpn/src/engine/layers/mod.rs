@@ -1,4 +1,4 @@
-//! Layers, each with its passes over a block of R samples, by hand. [`passes`] has the names of their arguments.
+//! Layers, each with hand-derived passes over a block of R samples. The passes' arguments are defined in [`passes`].
 
 pub mod conv2d;
 pub mod conv2d_params;

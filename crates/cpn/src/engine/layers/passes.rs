@@ -1,13 +1,13 @@
-//! Arguments of the passes over a layer. A dot is a tangent, a bar the inner loss' gradient, a hat the gradient of Φ = ŷᵀy + ȳᵀẏ.
+//! Arguments of a layer's passes. Dot: tangent; bar: gradient of the inner loss; hat: gradient of Φ = ŷᵀy + ȳᵀẏ.
 
-/// The terms of Φ = ŷᵀy + ȳᵀẏ in a double backward pass: the first, or both.
+/// Terms of Φ = ŷᵀy + ȳᵀẏ in a double backward pass: the first, or both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     First,
     Second,
 }
 
-/// Inputs of a layer `[R, inputs]` with their tangents; in the first order `x_dot` is empty.
+/// Inputs of a layer, `[R, inputs]`, with their tangents; in the first order `x_dot` is empty.
 #[derive(Debug, Clone, Copy)]
 pub struct Primal<'a, T> {
     pub x: &'a [T],
@@ -28,8 +28,8 @@ impl<T> Cotangent<'_, T> {
     }
 }
 
-/// Factors of a weight gradient, stacked for one product: `x` holds x `[R, inputs]` and, in the second order, ẋ after it; `y`
-/// holds ŷ `[R, outputs]` and ȳ likewise. Both are packed across their rows.
+/// Factors of a weight gradient, stacked for one product and packed across their rows: `x` holds x `[R, inputs]`, `y` holds ŷ
+/// `[R, outputs]`; in the second order they are followed by ẋ and ȳ.
 #[derive(Debug, Clone, Copy)]
 pub struct Stacked<'a, E> {
     pub x: &'a [E],

@@ -1,4 +1,4 @@
-//! The encoder's projection: its last linear layer, from features to the embedding before normalisation.
+//! Projection of the encoder: its last linear layer, from features to the embedding before normalisation.
 
 use super::linear::{Linear, LinearGradient};
 use super::passes::Stacked;
@@ -6,13 +6,13 @@ use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::{Element, Operand};
 use crate::precision::Precision;
 
-/// A linear layer in full or in half precision.
+/// A linear layer in full or half precision.
 #[derive(Debug)]
 pub struct Projection<T: Element> {
     linear: PrecisionLinear<T>,
-    /// F.
+    /// F, the number of features.
     pub inputs: usize,
-    /// Z.
+    /// Z, the size of the embedding.
     pub outputs: usize,
 }
 
@@ -22,7 +22,7 @@ enum PrecisionLinear<T: Element> {
     Half(Linear<T::Half, T>),
 }
 
-/// Workspace for both sides of the products as packed operands.
+/// Workspace for both factors of a product as packed operands.
 #[derive(Debug)]
 pub struct ProjectionWorkspace<T: Element> {
     full: [AlignedVec<T>; 2],
@@ -30,14 +30,14 @@ pub struct ProjectionWorkspace<T: Element> {
 }
 
 impl<T: Element> ProjectionWorkspace<T> {
-    /// An empty workspace; it grows.
+    /// An empty workspace, which grows on use.
     pub fn new() -> Self {
         Self { full: [zeros(0), zeros(0)], half: [zeros(0), zeros(0)] }
     }
 }
 
 impl<T: Element> Projection<T> {
-    /// A projection of weight `[Z, F]` and bias `[Z]`; with an odd size it is always in full precision.
+    /// A projection of weight `[Z, F]` and bias `[Z]`; always in full precision if F or Z is odd.
     pub fn new(weight: &[T], bias: Vec<T>, precision: Precision) -> Self {
         let (inputs, outputs) = (weight.len() / bias.len(), bias.len());
         let can_pack = [inputs, outputs].iter().all(|size| size.is_multiple_of(T::Half::PACK));
@@ -57,7 +57,7 @@ impl<T: Element> Projection<T> {
         }
     }
 
-    /// The first-order backward pass: from x `[R, F]` and ŷ `[R, Z]` writes x̂ and adds to the weights' gradient.
+    /// First-order backward pass from x `[R, F]` and ŷ `[R, Z]`: writes x̂, and adds to the weights' gradient.
     pub fn vjp(
         &self,
         x: &[T],
@@ -72,7 +72,7 @@ impl<T: Element> Projection<T> {
         }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> LinearGradient<T> {
         LinearGradient { weight: zeros(self.outputs * self.inputs), bias: zeros(self.outputs) }
     }

@@ -1,27 +1,26 @@
-//! The rectified linear unit, and the set of inputs that it leaves active.
+//! Rectified linear unit, and the active set of its outputs.
 
 use crate::engine::simd::element::Element;
 use pulp::{Arch, Simd, WithSimd};
 
-/// The rectified linear unit, in place; NaN stays NaN, so that it is seen.
+/// The rectified linear unit, in place; NaN stays NaN, so that it is detected.
 pub fn relu<T: Element>(x: &mut [T]) {
     Arch::new().dispatch(Relu { x });
 }
 
-/// The unit's derivative times `x`, in place, where `activations` are its outputs: `x` is a tangent on the way forward, a gradient
-/// on the way back.
+/// The unit's derivative times `x`, in place, from its outputs `activations`: the vjp of a gradient, and the jvp of a tangent.
 pub fn relu_mask<T: Element>(x: &mut [T], activations: &[T]) {
     Arch::new().dispatch(Mask { x, activations });
 }
 
-/// Active columns of each row of a matrix, by ranges of columns: the others are zero after a rectified linear unit, so that their
-/// factors are not needed, neither forward nor back.
+/// Active columns of each row of a matrix, by ranges of columns. The inactive ones are zero after a rectified linear unit, so that
+/// no pass needs their weights.
 #[derive(Debug)]
 pub struct ActiveSet {
     rows: usize,
-    /// Columns of a range.
+    /// Number of columns of a range.
     range: usize,
-    /// Ends of each range's rows among `columns`.
+    /// Ends of each range's rows in `columns`.
     ends: Vec<usize>,
     columns: Vec<u32>,
 }
@@ -32,11 +31,11 @@ impl ActiveSet {
         Self { rows: 0, range: 0, ends: Vec::new(), columns: Vec::new() }
     }
 
-    /// Scans x, `[R, columns]`, in ranges of `range` columns. The first `rectified` columns of a row are outputs of the unit; the
-    /// others are active whatever they are.
+    /// Scans x, `[R, columns]`, in ranges of `range` columns. The first `rectified` columns of a row are outputs of the unit; all
+    /// others are active.
     pub fn scan<T: Element>(&mut self, x: &[T], columns: usize, rectified: usize, range: usize) {
         (self.rows, self.range) = (x.len() / columns, range);
-        // One more than there can be: an inactive column is written all the same, and then written over.
+        // One more than the maximum: inactive columns are written too, and then overwritten.
         self.columns.resize(x.len() + 1, 0);
         self.ends.clear();
         self.ends.push(0);
@@ -59,7 +58,7 @@ impl ActiveSet {
         }
     }
 
-    /// Active columns of row r in the range that begins at column `first`.
+    /// Active columns of row r in the range from column `first` on.
     #[inline(always)]
     pub fn row(&self, first: usize, r: usize) -> &[u32] {
         let index = first / self.range * self.rows + r;
@@ -105,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_unit_keeps_what_is_positive_and_what_is_no_number() {
+    fn the_unit_keeps_positive_numbers_and_nan() {
         let mut x = [-1.0, 0.0, 2.0, f32::NAN, -0.0, f32::INFINITY];
         relu(&mut x);
         assert_eq!(x[..3], [0.0, 0.0, 2.0]);
@@ -116,7 +115,7 @@ mod tests {
         assert_eq!(gradient, [0.0, 0.0, 5.0, 0.0, 0.0, 5.0]);
     }
 
-    /// Every range size, every number of rectified columns, against a look at each number; a set is used again for other sizes.
+    /// All range sizes and numbers of rectified columns; a set is reused for other sizes.
     #[test]
     fn the_active_set_is_that_of_a_naive_scan() {
         let mut set = ActiveSet::new();
@@ -140,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_none_is_active() {
+    fn nan_is_active() {
         let mut set = ActiveSet::new();
         set.scan(&[0.0, f64::NAN, -1.0], 3, 3, 3);
         assert_eq!(set.row(0, 0), [1, 2]);

@@ -1,8 +1,8 @@
-//! Winograd convolution: minimal filtering, a convolution by fewer products (Lavin and Gray, arXiv 1509.09308).
+//! Winograd convolution, or minimal filtering: a convolution with fewer products (Lavin and Gray, arXiv 1509.09308).
 //!
-//! A kernel as wide as r = 2 or 3 strides has r taps in either direction, each of which weighs a block of stride x stride pixels.
+//! A kernel of r = 2 or 3 strides has r taps in each direction, and a tap has the weights of a block of stride x stride pixels.
 //! [Tiles](super::winograd_transform) of 4 x 4 blocks give m x m outputs, m = 5 - r, by 16 products for each pair of channels,
-//! where patches take 36: each is a linear layer of its own, whose weights are sums of taps.
+//! instead of 36 with patches. Each product is a linear layer, whose weights are linear combinations of taps.
 
 use super::conv2d_params::Conv2dParams;
 use super::linear::{Linear, LinearGradient};
@@ -12,24 +12,24 @@ use crate::engine::simd::buffer::{AlignedVec, resize, zeros};
 use crate::engine::simd::element::{Element, Operand};
 use std::array;
 
-/// Tiles that are multiplied at once, rounded up to whole images: with more of them weights are read less often, with fewer the
-/// products lie nearer.
+/// Number of tiles in a product, rounded up to whole images: more tiles read the weights less often, and fewer keep the
+/// intermediates in nearer caches.
 const TILES_AT_ONCE: usize = 64;
 
-/// A convolution over images whose channels lie together, `[S, S, C]`, and a rectified linear unit; E is the operand type of its
-/// products.
+/// A convolution with a rectified linear unit over images `[S, S, C]`, channels last; E is the operand type of its products.
 #[derive(Debug)]
 pub struct Winograd<E: Operand> {
     tiling: Tiling,
-    /// r.
+    /// r, the number of taps in each direction.
     taps: usize,
-    /// g at each pair of points, from D = stride² C to O; at 1 in both directions, which every output has once, with the bias.
+    /// g at each pair of points, from D = stride² C to O. The bias is in the pair of ones, which contributes to each output with
+    /// coefficient one.
     points: Vec<PointLinear<E>>,
 }
 
 type PointLinear<E> = Linear<E, <E as Operand>::Sum>;
 
-/// Workspace for intermediates between an image and its outputs, kept from image to image.
+/// Workspace for intermediates between images and outputs.
 #[derive(Debug)]
 pub struct WinogradWorkspace<E: Operand> {
     tiles: TileBuffers<E::Sum>,
@@ -41,13 +41,13 @@ pub struct WinogradWorkspace<E: Operand> {
 struct TileBuffers<T> {
     /// Workspace of the transforms.
     transforms: AlignedVec<T>,
-    /// d or d̂ at one point of the vertical, `[tiles, D]` for each point of the horizontal, with [`PADDING`] behind them.
+    /// d or d̂ at one vertical point, `[tiles, D]` and [`PADDING`] for each horizontal point.
     d: AlignedVec<T>,
     /// p or p̂, `[tiles, O]` for each pair of points.
     p: AlignedVec<T>,
 }
 
-/// The product at a pair of points: d `[tiles, D]` times g to p `[tiles, O]`.
+/// The product at a pair of points: p `[tiles, O]` of d `[tiles, D]` times g.
 struct PointProduct<'a, E: Operand> {
     pair: usize,
     layer: &'a PointLinear<E>,
@@ -56,7 +56,7 @@ struct PointProduct<'a, E: Operand> {
 }
 
 impl<E: Operand> WinogradWorkspace<E> {
-    /// An empty workspace; it grows.
+    /// An empty workspace, which grows on use.
     pub fn new() -> Self {
         let tiles = TileBuffers { transforms: zeros(0), d: zeros(0), p: zeros(0) };
         Self { tiles, packed: [zeros(0), zeros(0)] }
@@ -64,7 +64,7 @@ impl<E: Operand> WinogradWorkspace<E> {
 }
 
 impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
-    /// A convolution of `weight`, `[O, C, K, K]`, and `bias`, `[O]`; None for sizes that minimal filtering does not suit.
+    /// A convolution of `weight`, `[O, C, K, K]`, and `bias`, `[O]`; `None` for sizes that minimal filtering does not support.
     pub fn new(params: Conv2dParams, weight: &[T], bias: &[T]) -> Option<Self> {
         let Conv2dParams { channels, kernel, stride, .. } = params;
         let taps = kernel / stride;
@@ -83,7 +83,7 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
         Some(Self { tiling, taps, points })
     }
 
-    /// y `[R, S', S', O]` of images x `[R, S, S, C]`, with [`PADDING`] behind them.
+    /// y `[R, S', S', O]` of images x `[R, S, S, C]`, followed by [`PADDING`].
     pub fn forward(&self, x: &[T], y: &mut [T], workspace: &mut WinogradWorkspace<E>) {
         let [inputs, outputs] = self.tiling.sizes();
         let images = self.images();
@@ -104,8 +104,8 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
         }
     }
 
-    /// The first-order backward pass from ŷ, a gradient before the unit: adds to the weights' gradient, and writes x̂ if there is
-    /// a buffer for it.
+    /// First-order backward pass from ŷ, the gradient before the rectified linear unit: adds to the weights' gradient, and writes
+    /// x̂ if given.
     pub fn vjp(
         &self,
         x: &[T],
@@ -127,7 +127,7 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
 
             let (p, _) = p.split_at_mut(p.len() / POINTS);
             for point in 0..POINTS {
-                // d is made again: it is up to three times as many numbers as the images.
+                // d is recomputed: stored, it would take up to three times the memory of the images.
                 self.tiling.input_transform(point, &x[i * images * inputs..], d, transforms);
                 self.tiling.output_adjoint(point, y_hat, p, transforms);
                 for PointProduct { pair, layer, d, p } in self.products(point, d, p) {
@@ -148,7 +148,7 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
         }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> Vec<LinearGradient<T>> {
         self.points.iter().map(Linear::gradient).collect()
     }
@@ -168,12 +168,12 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
         [weight, gradient[ONES].bias.to_vec()]
     }
 
-    /// Number of images that go through at once.
+    /// Number of images in a product.
     fn images(&self) -> usize {
         TILES_AT_ONCE.div_ceil(self.tiling.in_image())
     }
 
-    /// Workspace of the transforms, d and p for so many images.
+    /// Workspace of the transforms, d and p, for a number of images.
     fn buffers<'a>(&self, images: usize, buffers: &'a mut TileBuffers<T>) -> [&'a mut [T]; 3] {
         let (tiles, layer) = (images * self.tiling.in_image(), &self.points[0]);
         let transforms = resize(&mut buffers.transforms, self.tiling.workspace_len());
@@ -181,21 +181,21 @@ impl<T: Element, E: Operand<Sum = T>> Winograd<E> {
         [transforms, d, resize(&mut buffers.p, PAIRS * tiles * layer.outputs)]
     }
 
-    /// The products at one point of the vertical and each of the horizontal.
+    /// The products at one vertical point and each horizontal point.
     fn products<'a>(
         &'a self,
         point: usize,
         d: &'a mut [T],
         p: &'a mut [T],
     ) -> impl Iterator<Item = PointProduct<'a, E>> {
-        let (size, apart) = (d.len() / POINTS - PADDING, p.len() / POINTS);
+        let (size, stride) = (d.len() / POINTS - PADDING, p.len() / POINTS);
         let d = d.chunks_exact_mut(size + PADDING).map(move |d| &mut d[..size]);
         let layers = self.points.iter().enumerate().skip(point * POINTS);
-        layers.zip(d.zip(p.chunks_exact_mut(apart))).map(|((pair, layer), (d, p))| PointProduct { pair, layer, d, p })
+        layers.zip(d.zip(p.chunks_exact_mut(stride))).map(|((pair, layer), (d, p))| PointProduct { pair, layer, d, p })
     }
 }
 
-/// Indices in `[O, C, K, K]` of the weights of tap i down and j across, `[O, D]`.
+/// Indices in `[O, C, K, K]` of the weights of a tap, `[O, D]`, the i-th vertically and the j-th horizontally.
 fn tap_indices(tiling: &Tiling, taps: usize, i: usize, j: usize) -> Vec<usize> {
     let &Tiling { channels, stride, outputs, .. } = tiling;
     let kernel = taps * stride;
@@ -210,7 +210,7 @@ fn tap_indices(tiling: &Tiling, taps: usize, i: usize, j: usize) -> Vec<usize> {
     indices
 }
 
-/// The kernel transform: g(t) = Σ gᵢ tⁱ of two or three taps at each point, halved at 1 and -1; at ∞ it is the last tap.
+/// The kernel transform: g(t) = Σ gᵢ tⁱ of two or three taps at each point, halved at 1 and -1; at ∞ the last tap.
 fn at_points<T: Element>(taps: Vec<Vec<T>>) -> [Vec<T>; POINTS] {
     let (first, second, last) = (&taps[0], &taps[1], &taps[taps.len() - 1]);
     let even = if taps.len() == 2 { first } else { &sums(first, last) };
@@ -218,7 +218,7 @@ fn at_points<T: Element>(taps: Vec<Vec<T>>) -> [Vec<T>; POINTS] {
     [first.clone(), one, minus_one, last.clone()]
 }
 
-/// The adjoint of [`at_points`]: a loss' gradient in each tap, from that in g at each point.
+/// The adjoint of [`at_points`]: the gradient in each tap, from the gradient in g at each point.
 fn in_taps<T: Element>(taps: usize, [zero, one, minus_one, infinity]: [&[T]; POINTS]) -> Vec<Vec<T>> {
     let [even, odd] = halves(one, minus_one);
     if taps == 2 {

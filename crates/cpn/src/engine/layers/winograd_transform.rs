@@ -1,13 +1,14 @@
-//! The input and output transforms of [minimal filtering](super::winograd): sums before and after its products.
+//! Input and output transforms of [minimal filtering](super::winograd): sums before and after its products.
 //!
-//! Four blocks in a row, d, give m sums of r = 5 - m taps, y, by four products, where g(t) = Σ gᵢ tⁱ and g(∞) is the last tap:
+//! In one direction, four blocks d give m outputs y of r = 5 - m taps by four products p, with g(t) = Σ gᵢ tⁱ and g(∞) the last
+//! tap:
 //!
 //! - p₀ = (d₀ - d₂) g(0), p₁ = (d₁ + d₂) g(1)/2, p₂ = (d₂ - d₁) g(-1)/2, p₃ = (d₁ - d₃) g(∞)
 //! - y₀ = p₀ + p₁ + p₂, then if m = 3 p₁ - p₂, and last p₁ ± p₂ - p₃, with + if m = 3
 //!
-//! A tile does so in both directions. These points need only sums and halves, which cost float32 next to nothing. Each transform
-//! is linear and has an adjoint, from a loss' gradient in its outputs to the gradient in its inputs. All but the output transform
-//! go through the points of one direction one after the other, so that their results lie near for the products.
+//! A tile applies this in both directions. These points need only sums and halves, with almost no loss of precision in float32.
+//! Each transform is linear and has an adjoint, from the gradient in its outputs to the gradient in its inputs. All but the output
+//! transform process one vertical point at a time, so that the products find their operands in nearer caches.
 
 use super::conv2d_params::Conv2dParams;
 use crate::engine::simd::element::Element;
@@ -15,18 +16,18 @@ use crate::engine::simd::vector::{Vector, registers, registers_mut};
 use pulp::{Arch, Simd, WithSimd};
 use std::array;
 
-/// The interpolation points 0, 1, -1 and ∞: as many as a tile has blocks in a row.
+/// Number of interpolation points 0, 1, -1 and ∞, and of a tile's blocks in each direction.
 pub const POINTS: usize = 4;
-/// The input transform at each point: indices of two d, and the sign of the second.
+/// Input transform at each point: indices of its two d, and the sign of the second.
 const INPUT_TERMS: [(usize, usize, i8); POINTS] = [(0, 2, -1), (1, 2, 1), (2, 1, -1), (1, 3, -1)];
-/// Pairs of points, one for each direction.
+/// Number of pairs of points, one for each direction.
 pub const PAIRS: usize = POINTS * POINTS;
-/// The pair of the point 1 in both directions.
+/// Index of the pair of the point 1 in both directions.
 pub const ONES: usize = POINTS + 1;
-/// Padding after a buffer, in numbers, so that a full-width access may overrun it: as many as the widest register holds.
+/// Padding after a buffer, so that a full-width access may overrun it, in elements: the size of the widest register.
 pub const PADDING: usize = 16;
 
-/// The division of images `[S, S, C]`, and of their outputs `[S', S', O]`, into tiles.
+/// Division of images `[S, S, C]`, and of their outputs `[S', S', O]`, into tiles.
 #[derive(Debug)]
 pub struct Tiling {
     /// S.
@@ -38,14 +39,14 @@ pub struct Tiling {
     pub outputs: usize,
     /// S'.
     size: usize,
-    /// m, outputs of a tile in a row.
+    /// m, the number of a tile's outputs in each direction.
     tile_outputs: usize,
-    /// Beginnings of the tiles in blocks, and in outputs, in either direction; the last early enough to end within the image.
+    /// First block, and first output, of the tiles in each direction; the last tile ends within the image, and may overlap.
     starts: Vec<usize>,
 }
 
 impl Tiling {
-    /// The tiles of m x m outputs, m = `tile_outputs`; None if the images are smaller than a tile.
+    /// Tiles of m x m outputs, m = `tile_outputs`; `None` if the images are smaller than a tile.
     pub fn new(params: Conv2dParams, tile_outputs: usize, outputs: usize) -> Option<Self> {
         let Conv2dParams { side, channels, stride, .. } = params;
         let size = (side / stride + tile_outputs).checked_sub(POINTS)?;
@@ -56,48 +57,48 @@ impl Tiling {
         })
     }
 
-    /// Tiles of an image.
+    /// Number of tiles of an image.
     pub fn in_image(&self) -> usize {
         self.starts.len().pow(2)
     }
 
-    /// Sizes of an image and of its outputs, in numbers.
+    /// Sizes of an image and of its outputs, in elements.
     pub fn sizes(&self) -> [usize; 2] {
         [self.side * self.side * self.channels, self.size * self.size * self.outputs]
     }
 
-    /// Size of the transforms' workspace, in numbers.
+    /// Size of the transforms' workspace, in elements.
     pub fn workspace_len(&self) -> usize {
         (self.band() + PADDING).max(POINTS * self.tile_outputs * self.outputs)
     }
 
-    /// Size of a block's part of a line, in numbers.
+    /// Size of a block's part of a line, in elements.
     fn run(&self) -> usize {
         self.stride * self.channels
     }
 
-    /// Size of a line of the image, in numbers.
+    /// Size of a line of the image, in elements.
     fn line(&self) -> usize {
         self.side * self.channels
     }
 
-    /// Size of the lines that a row of blocks spans, in numbers.
+    /// Size of the lines of a row of blocks, in elements.
     fn band(&self) -> usize {
         self.stride * self.line()
     }
 
-    /// The input transform in both directions, of images to d at one point of the vertical: `[tiles, D]` for each point of the
-    /// horizontal, with [`PADDING`] behind it and behind the images.
+    /// The input transform in both directions, of images to d at one vertical point: `[tiles, D]` and [`PADDING`] for each
+    /// horizontal point. The images are followed by [`PADDING`].
     pub fn input_transform<T: Element>(&self, point: usize, x: &[T], d: &mut [T], workspace: &mut [T]) {
         Arch::new().dispatch(InputTransform { tiling: self, point, x, d, workspace });
     }
 
-    /// The adjoint of [`Self::input_transform`]: from d̂ at a point, added to x̂.
+    /// The adjoint of [`Self::input_transform`]: adds the contribution of d̂ at a vertical point to x̂.
     pub fn input_adjoint<T: Element>(&self, point: usize, d: &[T], x: &mut [T], workspace: &mut [T]) {
         Arch::new().dispatch(InputAdjoint { tiling: self, point, d, x, workspace });
     }
 
-    /// The output transform, and the rectified linear unit: from p, `[tiles, O]` for each pair of points, to outputs.
+    /// The output transform and the rectified linear unit: outputs y of p, `[tiles, O]` for each pair of points.
     pub fn output_transform<T: Element>(&self, p: &[T], y: &mut [T], workspace: &mut [T]) {
         match self.tile_outputs {
             2 => Arch::new().dispatch(OutputTransform::<T, 2> { tiling: self, p, y, workspace }),
@@ -105,7 +106,7 @@ impl Tiling {
         }
     }
 
-    /// The adjoint of the output transform at one point of the vertical: p̂ from ŷ, a gradient before the unit.
+    /// The adjoint of the output transform at one vertical point: p̂ of ŷ, the gradient before the rectified linear unit.
     pub fn output_adjoint<T: Element>(&self, point: usize, y: &[T], p: &mut [T], workspace: &mut [T]) {
         match self.tile_outputs {
             2 => Arch::new().dispatch(OutputAdjoint::<T, 2> { tiling: self, point, y, p, workspace }),
@@ -114,8 +115,8 @@ impl Tiling {
     }
 }
 
-/// [`Tiling::input_transform`]. A register's overrun past the end of a line, or of a block's part of it, is overwritten by the next
-/// one.
+/// [`Tiling::input_transform`]. Stores of full registers overrun a line, or a block's part of it; the next store overwrites the
+/// overrun.
 #[derive(Debug)]
 struct InputTransform<'a, T> {
     tiling: &'a Tiling,
@@ -137,13 +138,13 @@ impl<T: Element> WithSimd for InputTransform<'_, T> {
         let mut d = parts::<T, POINTS>(d);
         for (row, first) in (0..count).step_by(starts.len()).enumerate() {
             let x = &x[row / starts.len() * tiling.sizes()[0] + starts[row % starts.len()] * band..];
-            // Vertically, a row of tiles at once; then horizontally, block by block.
-            combine_at(simd, point, band, x, lines);
+            // Vertically for a row of tiles, then horizontally for each block.
+            input_sums_at(simd, point, band, x, lines);
             for (t, left) in starts.iter().enumerate() {
                 for y in 0..*stride {
                     let block = |j| &lines[y * line + (left + j) * run..];
                     let into = d.each_mut().map(|d| &mut d[((first + t) * stride + y) * run..]);
-                    combine(simd, run, [block(0), block(1), block(2), block(3)], into);
+                    input_sums(simd, run, [block(0), block(1), block(2), block(3)], into);
                 }
             }
         }
@@ -179,10 +180,10 @@ impl<T: Element> WithSimd for InputAdjoint<'_, T> {
                     for y in 0..*stride {
                         let block = |j| &d[j * apart + ((first + t) * stride + y) * run..][..run];
                         let into = parts::<T, POINTS>(&mut lines[y * line + left * run..][..POINTS * run]);
-                        combine_adjoint(simd, [block(0), block(1), block(2), block(3)], into);
+                        input_sums_adjoint(simd, [block(0), block(1), block(2), block(3)], into);
                     }
                 }
-                combine_at_adjoint(simd, point, lines, &mut image[top * band..][..POINTS * band]);
+                input_sums_at_adjoint(simd, point, lines, &mut image[top * band..][..POINTS * band]);
                 first += starts.len();
             }
         }
@@ -191,14 +192,14 @@ impl<T: Element> WithSimd for InputAdjoint<'_, T> {
 
 /// [`Tiling::output_transform`].
 #[derive(Debug)]
-struct OutputTransform<'a, T, const KEPT: usize> {
+struct OutputTransform<'a, T, const M: usize> {
     tiling: &'a Tiling,
     p: &'a [T],
     y: &'a mut [T],
     workspace: &'a mut [T],
 }
 
-impl<T: Element, const KEPT: usize> WithSimd for OutputTransform<'_, T, KEPT> {
+impl<T: Element, const M: usize> WithSimd for OutputTransform<'_, T, M> {
     type Output = ();
 
     #[inline(always)]
@@ -206,21 +207,21 @@ impl<T: Element, const KEPT: usize> WithSimd for OutputTransform<'_, T, KEPT> {
         let Self { tiling: &Tiling { size, outputs, ref starts, .. }, p, y, workspace } = self;
         let apart = p.len() / PAIRS;
         // [m, POINTS, O]
-        let half = &mut workspace[..KEPT * POINTS * outputs];
+        let half = &mut workspace[..M * POINTS * outputs];
         let mut tile = 0;
         for image in y.chunks_exact_mut(size * size * outputs) {
             for (top, left) in starts.iter().flat_map(|top| starts.iter().map(move |left| (top, left))) {
-                // Vertically, to m rows of each point; then horizontally, to m outputs of each row.
+                // Vertically to m rows at each point, then horizontally to m outputs of each row.
                 for j in 0..POINTS {
                     let row = |i| &p[(i * POINTS + j) * apart + tile * outputs..];
-                    let into = parts::<T, KEPT>(half).map(|half| &mut half[j * outputs..]);
-                    keep(simd, outputs, [row(0), row(1), row(2), row(3)], into, |y| y);
+                    let into = parts::<T, M>(half).map(|half| &mut half[j * outputs..]);
+                    output_sums(simd, outputs, [row(0), row(1), row(2), row(3)], into, |y| y);
                 }
                 for (i, half) in half.chunks_exact(POINTS * outputs).enumerate() {
                     let column = |j| &half[j * outputs..];
-                    let into = &mut image[((top + i) * size + left) * outputs..][..KEPT * outputs];
+                    let into = &mut image[((top + i) * size + left) * outputs..][..M * outputs];
                     let columns = [column(0), column(1), column(2), column(3)];
-                    keep(simd, outputs, columns, parts::<T, KEPT>(into), Vector::relu);
+                    output_sums(simd, outputs, columns, parts::<T, M>(into), Vector::relu);
                 }
                 tile += 1;
             }
@@ -230,7 +231,7 @@ impl<T: Element, const KEPT: usize> WithSimd for OutputTransform<'_, T, KEPT> {
 
 /// [`Tiling::output_adjoint`].
 #[derive(Debug)]
-struct OutputAdjoint<'a, T, const KEPT: usize> {
+struct OutputAdjoint<'a, T, const M: usize> {
     tiling: &'a Tiling,
     point: usize,
     y: &'a [T],
@@ -238,13 +239,13 @@ struct OutputAdjoint<'a, T, const KEPT: usize> {
     workspace: &'a mut [T],
 }
 
-impl<T: Element, const KEPT: usize> WithSimd for OutputAdjoint<'_, T, KEPT> {
+impl<T: Element, const M: usize> WithSimd for OutputAdjoint<'_, T, M> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { tiling: &Tiling { size, outputs, ref starts, .. }, point, y, p, workspace } = self;
-        let width = KEPT * outputs;
+        let width = M * outputs;
         // [m, O], and zeros.
         let (half, zeros) = workspace.split_at_mut(width);
         zeros[..width].fill(T::ZERO);
@@ -253,13 +254,13 @@ impl<T: Element, const KEPT: usize> WithSimd for OutputAdjoint<'_, T, KEPT> {
         for image in y.chunks_exact(size * size * outputs) {
             for (down, top) in starts.iter().enumerate() {
                 for (across, left) in starts.iter().enumerate() {
-                    // The outputs that a tile shares with the one before belong to that one alone.
-                    let (above, before) = (down * KEPT - top, across * KEPT - left);
+                    // Outputs shared with the previous tile count for that tile only.
+                    let (above, before) = (down * M - top, across * M - left);
                     let row = |i| if i < above { &*zeros } else { &image[((top + i) * size + left) * outputs..] };
-                    keep_at_adjoint(simd, point, width, array::from_fn::<_, KEPT, _>(row), half);
+                    output_sums_at_adjoint(simd, point, width, array::from_fn::<_, M, _>(row), half);
                     let column = |j| if j < before { &*zeros } else { &half[j * outputs..] };
                     let into = p.each_mut().map(|p| &mut p[tile * outputs..]);
-                    keep_adjoint(simd, outputs, array::from_fn::<_, KEPT, _>(column), into);
+                    output_sums_adjoint(simd, outputs, array::from_fn::<_, M, _>(column), into);
                     tile += 1;
                 }
             }
@@ -267,9 +268,9 @@ impl<T: Element, const KEPT: usize> WithSimd for OutputAdjoint<'_, T, KEPT> {
     }
 }
 
-/// The input transform of four d in a row, each of `length` numbers.
+/// The input transform of four d in one direction, each of `length` elements.
 #[inline(always)]
-fn combine<S: Simd, T: Element>(simd: S, length: usize, d: [&[T]; POINTS], into: [&mut [T]; POINTS]) {
+fn input_sums<S: Simd, T: Element>(simd: S, length: usize, d: [&[T]; POINTS], into: [&mut [T]; POINTS]) {
     let count = length.div_ceil(Vector::<S, T>::COUNT);
     let d = registers(simd, d, count);
     let into = registers_mut(simd, into, count);
@@ -282,9 +283,9 @@ fn combine<S: Simd, T: Element>(simd: S, length: usize, d: [&[T]; POINTS], into:
     }
 }
 
-/// [`combine`] at one point alone, of d that lie one after the other.
+/// [`input_sums`] at one point, of consecutive d.
 #[inline(always)]
-fn combine_at<S: Simd, T: Element>(simd: S, point: usize, length: usize, d: &[T], into: &mut [T]) {
+fn input_sums_at<S: Simd, T: Element>(simd: S, point: usize, length: usize, d: &[T], into: &mut [T]) {
     let (first, second, sign) = INPUT_TERMS[point];
     let count = length.div_ceil(Vector::<S, T>::COUNT);
     let d = registers(simd, [&d[first * length..], &d[second * length..]], count);
@@ -296,9 +297,9 @@ fn combine_at<S: Simd, T: Element>(simd: S, point: usize, length: usize, d: &[T]
     }
 }
 
-/// The adjoint of [`combine_at`], added to d̂.
+/// The adjoint of [`input_sums_at`], added to d̂.
 #[inline(always)]
-fn combine_at_adjoint<S: Simd, T: Element>(simd: S, point: usize, from: &[T], d: &mut [T]) {
+fn input_sums_at_adjoint<S: Simd, T: Element>(simd: S, point: usize, from: &[T], d: &mut [T]) {
     let (first, second, sign) = INPUT_TERMS[point];
     let d = parts::<T, POINTS>(d);
     let sign = Vector::splat(simd, T::from_f64(sign.into()));
@@ -309,9 +310,9 @@ fn combine_at_adjoint<S: Simd, T: Element>(simd: S, point: usize, from: &[T], d:
     }
 }
 
-/// The adjoint of [`combine`], added to d̂ in a row.
+/// The adjoint of [`input_sums`], added to d̂.
 #[inline(always)]
-fn combine_adjoint<S: Simd, T: Element>(simd: S, from: [&[T]; POINTS], d: [&mut [T]; POINTS]) {
+fn input_sums_adjoint<S: Simd, T: Element>(simd: S, from: [&[T]; POINTS], d: [&mut [T]; POINTS]) {
     let [d0, d1, d2, d3] = d;
     for at in (0..d0.len()).step_by(Vector::<S, T>::COUNT) {
         let mut rest = from;
@@ -326,13 +327,13 @@ fn combine_adjoint<S: Simd, T: Element>(simd: S, from: [&[T]; POINTS], d: [&mut 
     }
 }
 
-/// The output transform of four p in a row, each of `length` numbers, to KEPT = m outputs, each passed through `finish`.
+/// The output transform of four p in one direction, each of `length` elements, to M = m outputs, with `finish` applied to each.
 #[inline(always)]
-fn keep<S: Simd, T: Element, const KEPT: usize>(
+fn output_sums<S: Simd, T: Element, const M: usize>(
     simd: S,
     length: usize,
     p: [&[T]; POINTS],
-    into: [&mut [T]; KEPT],
+    into: [&mut [T]; M],
     finish: impl Fn(Vector<S, T>) -> Vector<S, T>,
 ) {
     let count = length.div_ceil(Vector::<S, T>::COUNT);
@@ -342,27 +343,27 @@ fn keep<S: Simd, T: Element, const KEPT: usize>(
         let [p0, p1, p2, p3] = Vector::<S, T>::from_registers(simd, [p[0][i], p[1][i], p[2][i], p[3][i]]);
         let (sum, difference) = (p1 + p2, p1 - p2);
         into[0][i] = finish(p0 + sum).register();
-        into[1][i] = finish(if KEPT == 2 { difference - p3 } else { difference }).register();
-        if KEPT == 3 {
+        into[1][i] = finish(if M == 2 { difference - p3 } else { difference }).register();
+        if M == 3 {
             into[2][i] = finish(sum - p3).register();
         }
     }
 }
 
-/// The adjoint of [`keep`]: p̂ of KEPT ŷ in a row, each of `length` numbers.
+/// The adjoint of [`output_sums`]: p̂ of M ŷ in one direction, each of `length` elements.
 #[inline(always)]
-fn keep_adjoint<S: Simd, T: Element, const KEPT: usize>(
+fn output_sums_adjoint<S: Simd, T: Element, const M: usize>(
     simd: S,
     length: usize,
-    y: [&[T]; KEPT],
+    y: [&[T]; M],
     into: [&mut [T]; POINTS],
 ) {
     let count = length.div_ceil(Vector::<S, T>::COUNT);
     let y = registers(simd, y, count);
     let into = registers_mut(simd, into, count);
     for i in 0..count {
-        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
-        let even = if KEPT == 2 { first } else { first + last };
+        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[M - 1][i]]);
+        let even = if M == 2 { first } else { first + last };
         into[0][i] = first.register();
         into[1][i] = (even + second).register();
         into[2][i] = (even - second).register();
@@ -370,24 +371,24 @@ fn keep_adjoint<S: Simd, T: Element, const KEPT: usize>(
     }
 }
 
-/// [`keep_adjoint`] at one point alone.
+/// [`output_sums_adjoint`] at one point.
 #[inline(always)]
-fn keep_at_adjoint<S: Simd, T: Element, const KEPT: usize>(
+fn output_sums_at_adjoint<S: Simd, T: Element, const M: usize>(
     simd: S,
     point: usize,
     length: usize,
-    y: [&[T]; KEPT],
+    y: [&[T]; M],
     into: &mut [T],
 ) {
     let count = length.div_ceil(Vector::<S, T>::COUNT);
     let y = registers(simd, y, count);
     let [into] = registers_mut(simd, [into], count);
-    // Coefficients of p at this point in the first, the second and the last output.
+    // Coefficients of p at this point in the first, second and last output.
     let shares = [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, -1.0]][point];
-    let shares = if KEPT == 2 && point != 3 { [shares[0], shares[1], 0.0] } else { shares };
+    let shares = if M == 2 && point != 3 { [shares[0], shares[1], 0.0] } else { shares };
     let shares = shares.map(|share| Vector::splat(simd, T::from_f64(share)));
     for i in 0..count {
-        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[KEPT - 1][i]]);
+        let [first, second, last] = Vector::<S, T>::from_registers(simd, [y[0][i], y[1][i], y[M - 1][i]]);
         into[i] = shares[2].mul_add(last, shares[1].mul_add(second, shares[0] * first)).register();
     }
 }
@@ -403,7 +404,7 @@ fn parts<T, const N: usize>(slice: &mut [T]) -> [&mut [T]; N] {
 mod tests {
     use super::*;
 
-    /// The transforms as matrices: Bᵀ, and Aᵀ for m = 2 and 3 (rows past the second or third are not there).
+    /// The transforms as matrices: Bᵀ, and Aᵀ for m = 2 and 3.
     const INPUT: [[f64; POINTS]; POINTS] =
         [[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, -1.0, 1.0, 0.0], [0.0, 1.0, 0.0, -1.0]];
     const OUTPUT: [&[[f64; POINTS]]; 2] = [
@@ -412,12 +413,12 @@ mod tests {
     ];
     const IMAGES: usize = 2;
 
-    /// Whole numbers, so that sums are exact.
+    /// Integers, so that sums are exact.
     fn numbers(count: usize, seed: usize) -> Vec<f64> {
         (0..count).map(|i| ((i * 7919 + seed * 104_729) % 97) as f64 - 48.0).collect()
     }
 
-    /// Sizes with one tile, with several, and with a last one that begins early, for both numbers of outputs.
+    /// Sizes with one tile, with several, and with an overlapping last one, for both numbers of outputs.
     fn tilings() -> Vec<(Conv2dParams, Tiling)> {
         let mut tilings = Vec::new();
         for (tile_outputs, side, channels, stride) in
@@ -430,7 +431,7 @@ mod tests {
         tilings
     }
 
-    /// Tiles of all images: image, index in either direction, beginning in either direction.
+    /// Tiles of all images: image, index in each direction, first block in each direction.
     fn tiles(tiling: &Tiling) -> Vec<[usize; 5]> {
         let starts: Vec<_> = tiling.starts.iter().copied().enumerate().collect();
         let mut tiles = Vec::new();
@@ -513,7 +514,7 @@ mod tests {
                             ((pair * tiles.len() + tile) * outputs + o, factor)
                         });
                         expected[at] = pairs.clone().map(|(p_at, factor)| factor * p[p_at]).sum::<f64>().max(0.0);
-                        // An output that two tiles share belongs to the first.
+                        // An output of two tiles counts for the first.
                         if a >= i * m - top && b >= j * m - left {
                             pairs.for_each(|(p_at, factor)| expected_p_hat[p_at] += factor * y_hat[at]);
                         }

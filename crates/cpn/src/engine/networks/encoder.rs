@@ -1,4 +1,4 @@
-//! The encoder f_φ, forward and back: first order only.
+//! Encoder f_φ, with its forward pass and its first-order backward pass.
 
 use crate::config::{EncoderConfig, ImageEncoderConfig, PositionEncoderConfig};
 use crate::engine::layers::conv2d::{Conv2d, Conv2dWorkspace, transpose};
@@ -17,29 +17,30 @@ use crate::precision::Precision;
 use pulp::{Arch, Simd, WithSimd};
 use std::mem::swap;
 
-/// Inputs that go through the layers at once: with more of them weights are read less often, with fewer a layer's outputs lie
-/// nearer.
+/// Number of inputs that pass the layers together: more read the weights less often, and fewer keep a layer's outputs in nearer
+/// caches.
 pub const GROUP: usize = 8;
 
-/// The encoder: layers that suit the input, then a projection to the embedding.
+/// The encoder: convolutions or linear layers by the kind of input, a projection to the embedding, and layer normalisation.
 #[derive(Debug)]
 pub struct Encoder<T: Element> {
     scaling: InputScaling<T>,
     layers: Vec<EncoderLayer<T>>,
-    /// Channels of the features, which stand first in the checkpoint and last here: the weights are transposed rather than they.
+    /// Channels of the features: first in the checkpoint's layout and last here, so that the projection's weights are transposed
+    /// rather than the features.
     channels: usize,
     projection: Projection<T>,
     norm: Option<LayerNorm<T>>,
 }
 
-/// The scaling of an input to the numbers of the first layer.
+/// Scaling of an input for the first layer.
 #[derive(Debug)]
 enum InputScaling<T> {
     Pixels,
     Position { centre_metres: [f64; 3], scale_metres: T },
 }
 
-/// A layer with the rectified linear unit behind it.
+/// A layer, followed by a rectified linear unit.
 #[derive(Debug)]
 enum EncoderLayer<T: Element> {
     Conv2d(Conv2d<T>),
@@ -54,12 +55,12 @@ pub struct EncoderGradient<T> {
     norm: Option<LinearGradient<T>>,
 }
 
-/// Tape of the encoder: activations that the forward pass leaves, and workspaces.
+/// Tape of the encoder: activations of the forward pass, and workspaces.
 #[derive(Debug)]
 pub struct EncoderTape<T: Element> {
-    /// For every [`GROUP`] inputs the activations before each layer but the first, with [`PADDING`] behind them.
+    /// Activations before each layer but the first, followed by [`PADDING`], for each [`GROUP`] inputs.
     groups: Vec<Vec<AlignedVec<T>>>,
-    /// The numbers before the first layer: soon made again, and four times as large as the bytes that they are made of.
+    /// Scaled inputs of the first layer. Not kept: they are fast to recompute, and four times as large as an image's bytes.
     first: AlignedVec<T>,
     /// `[R, F]`.
     features: AlignedVec<T>,
@@ -68,13 +69,13 @@ pub struct EncoderTape<T: Element> {
     conv2d: Conv2dWorkspace<T>,
     projection: ProjectionWorkspace<T>,
     features_hat: AlignedVec<T>,
-    /// x̂ of a layer, and x̂ of the one behind it.
+    /// x̂ of a layer, and ŷ, which is x̂ of the next layer.
     x_hat: AlignedVec<T>,
     y_hat: AlignedVec<T>,
 }
 
 impl<T: Element> EncoderTape<T> {
-    /// An empty tape; it grows.
+    /// An empty tape, which grows on use.
     pub fn new() -> Self {
         Self {
             groups: Vec::new(),
@@ -91,8 +92,8 @@ impl<T: Element> EncoderTape<T> {
 }
 
 impl<T: Element> Encoder<T> {
-    /// The encoder of a valid configuration. Images are multiplied in this precision, positions in full: there is little to
-    /// multiply, and a place needs more than 8 bits.
+    /// The encoder of a valid configuration. `precision` applies to images; positions are always encoded in float32, since their
+    /// layers are small, and 8 bits are too coarse for coordinates.
     pub fn new(config: &EncoderConfig, precision: Precision, weights: &impl Weights<T>) -> Self {
         let (Body { scaling, layers, channels }, precision) = match config {
             EncoderConfig::Image(config) => (Body::image(config, precision, weights), precision),
@@ -110,8 +111,8 @@ impl<T: Element> Encoder<T> {
         self.projection.outputs
     }
 
-    /// Embeddings `[R, Z]` of images of 84 x 84 or of positions, as the configuration has it. Before [`Self::vjp`] the tape is to
-    /// be kept whole, `keep_tape`.
+    /// Embeddings `[R, Z]` of images of 84 x 84 or of positions, by the configuration. [`Self::vjp`] needs the activations of all
+    /// inputs, `keep_tape`.
     pub fn forward(&self, inputs: &[Observed<'_>], keep_tape: bool, tape: &mut EncoderTape<T>) -> Vec<T> {
         let count = if keep_tape { inputs.len().div_ceil(GROUP) } else { 1 };
         if tape.groups.len() < count {
@@ -134,8 +135,8 @@ impl<T: Element> Encoder<T> {
         }
     }
 
-    /// The first-order backward pass from a gradient in the embeddings, `[R, Z]`, after a [`Self::forward`] of these inputs that
-    /// kept the tape: adds to the weights' gradient.
+    /// First-order backward pass from the gradient in the embeddings, `hat`, `[R, Z]`, after [`Self::forward`] of the same inputs
+    /// with `keep_tape`: adds to the weights' gradient.
     pub fn vjp(
         &self,
         inputs: &[Observed<'_>],
@@ -147,6 +148,8 @@ impl<T: Element> Encoder<T> {
         if let (Some(norm), Some(gradient)) = (&self.norm, &mut gradient.norm) {
             norm.vjp(&tape.x, &mut hat, gradient);
         }
+
+        // The projection.
         let group = GROUP * self.projection.inputs;
         let features = &tape.features[..rows * self.projection.inputs];
         let features_hat = resize(&mut tape.features_hat, features.len());
@@ -177,7 +180,7 @@ impl<T: Element> Encoder<T> {
         }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> EncoderGradient<T> {
         EncoderGradient {
             layers: self.layers.iter().map(EncoderLayer::gradient).collect(),
@@ -186,13 +189,14 @@ impl<T: Element> Encoder<T> {
         }
     }
 
-    /// A gradient by the names of the weights.
+    /// A gradient by the weights' names in a checkpoint.
     pub fn in_weights(&self, gradient: &EncoderGradient<T>) -> Vec<(String, Vec<T>)> {
         let mut weights = Vec::new();
         let mut add = |name: String, [weight, bias]: [Vec<T>; 2]| {
             weights.push((format!("encoder.{name}.weight"), weight));
             weights.push((format!("encoder.{name}.bias"), bias));
         };
+
         for (i, (layer, gradient)) in self.layers.iter().zip(&gradient.layers).enumerate() {
             match layer {
                 EncoderLayer::Conv2d(conv2d) => add(format!("conv.{i}"), conv2d.in_weights(gradient)),
@@ -201,6 +205,7 @@ impl<T: Element> Encoder<T> {
                 }
             }
         }
+
         let LinearGradient { weight, bias } = &gradient.projection;
         let positions = self.projection.inputs / self.channels;
         add("linear".to_owned(), [transpose(weight, positions, self.channels), bias.to_vec()]);
@@ -230,7 +235,7 @@ impl<T: Element> Encoder<T> {
         last.forward(inputs.len(), x, features, workspace);
     }
 
-    /// Scaled inputs of the first layer, with [`PADDING`] behind them.
+    /// Scaled inputs of the first layer, followed by [`PADDING`].
     fn scaled<'a>(&self, inputs: &[Observed<'_>], x: &'a mut AlignedVec<T>) -> &'a [T] {
         let x = resize(x, inputs.len() * self.layers[0].inputs() + PADDING);
         self.scaling.write(inputs, x);
@@ -268,7 +273,7 @@ impl<T: Element> Body<T> {
         Self { scaling: InputScaling::Pixels, layers, channels }
     }
 
-    /// The linear layers; their features have no positions.
+    /// The linear layers; their features are channels at a single position.
     fn position(config: &PositionEncoderConfig, weights: &impl Weights<T>) -> Self {
         let scaling = InputScaling::Position {
             centre_metres: config.centre_mm.map(|mm| mm as f64 / 1e3),
@@ -301,7 +306,7 @@ impl<T: Element> EncoderLayer<T> {
         }
     }
 
-    /// y of x, for R = `rows` inputs, after the unit.
+    /// y of x, for R = `rows` inputs, after the rectified linear unit.
     fn forward(&self, rows: usize, x: &[T], y: &mut [T], workspace: &mut Conv2dWorkspace<T>) {
         match self {
             Self::Conv2d(conv2d) => conv2d.forward(x, y, workspace),
@@ -312,8 +317,8 @@ impl<T: Element> EncoderLayer<T> {
         }
     }
 
-    /// The first-order backward pass from ŷ, a gradient before the unit: adds to the weights' gradient, and writes x̂ if there is
-    /// a buffer for it.
+    /// First-order backward pass from ŷ, the gradient before the rectified linear unit: adds to the weights' gradient, and writes
+    /// x̂ if given.
     fn vjp(
         &self,
         rows: usize,
@@ -337,7 +342,7 @@ impl<T: Element> EncoderLayer<T> {
 }
 
 impl<T: Element> InputScaling<T> {
-    /// x of each input, one after the other.
+    /// Writes the scaled inputs, `[R, inputs of the first layer]`.
     fn write(&self, inputs: &[Observed<'_>], x: &mut [T]) {
         match self {
             Self::Pixels => {
@@ -358,7 +363,7 @@ impl<T: Element> InputScaling<T> {
     }
 }
 
-/// Scaling of bytes to numbers from -1/2 to 1/2.
+/// Scaling of bytes to [-1/2, 1/2].
 struct Scale<'a, T> {
     bytes: &'a [u8],
     x: &'a mut [T],
@@ -367,7 +372,7 @@ struct Scale<'a, T> {
 impl<T: Element> WithSimd for Scale<'_, T> {
     type Output = ();
 
-    // Nothing here names a register; the compiler finds them, as wide as the dispatch says there are.
+    // The compiler vectorises the loop for the instructions of the dispatch.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
         let (step, half) = (T::ONE / T::count(255), T::ONE / T::count(2));

@@ -1,4 +1,4 @@
-//! The networks: the encoder f_φ and the combined policy and dynamics g_θ, each with its passes.
+//! Networks: encoder f_φ and policy dynamics network g_θ, with their passes.
 
 pub mod encoder;
 pub mod policy_dynamics;

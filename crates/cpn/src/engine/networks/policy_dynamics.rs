@@ -1,4 +1,4 @@
-//! The combined policy and dynamics g_θ: the four passes over one step of a rollout.
+//! Policy dynamics network g_θ, with its four passes over one step of a rollout.
 
 use crate::config::ModelConfig;
 use crate::engine::layers::dense::{Dense, DenseGradient, LayerTape};
@@ -10,11 +10,11 @@ use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
 
-/// Names of the layers of both branches.
+/// Names of the branches' layers.
 const POLICY: [&str; 2] = ["policy_0", "policy_1"];
 const DYNAMICS: [&str; 2] = ["dynamics_0", "dynamics_1"];
 
-/// Weights of g_θ: a trunk, and the branches for the action and for the next state.
+/// The network g_θ: a trunk, with branches for the action and for the next state.
 #[derive(Debug)]
 pub struct PolicyDynamics<T> {
     trunk: Dense<T>,
@@ -26,14 +26,14 @@ pub struct PolicyDynamics<T> {
 /// Widths of the network.
 #[derive(Debug, Clone, Copy)]
 pub struct Sizes {
-    /// Z.
+    /// Z, the size of a state.
     pub latent: usize,
     /// Width of the trunk's features and of the hidden layers.
     pub hidden: usize,
-    /// A.
+    /// A, the number of actions.
     pub actions: usize,
-    /// Width of the trunk's inputs: x, and x_g if it is conditioned on the goal.
-    pub seen: usize,
+    /// Width of the trunk's inputs: x, and x_g if the method is goal-conditioned.
+    pub trunk_inputs: usize,
 }
 
 /// Gradient of a loss in the network's weights.
@@ -44,7 +44,7 @@ pub struct PolicyDynamicsGradient<T> {
     pub dynamics: Option<[DenseGradient<T>; 2]>,
 }
 
-/// Tape of a step: intermediates that its passes leave for each other.
+/// Tape of a step: intermediates for later passes.
 #[derive(Debug)]
 pub struct StepTape<T> {
     trunk: LayerTape<T>,
@@ -56,11 +56,11 @@ pub struct StepTape<T> {
     proposed: AlignedVec<T>,
 }
 
-/// Buffers that no pass needs beyond its end.
+/// Scratch buffers of a pass, shared by the steps.
 #[derive(Debug)]
 pub struct Buffers<T> {
     gates: Scratch<T>,
-    /// Features with the action, or the trunk's inputs.
+    /// Gradients in features and action, or in the trunk's inputs.
     wide: AlignedVec<T>,
     narrow: AlignedVec<T>,
 }
@@ -82,12 +82,12 @@ impl<T: Element> PolicyDynamics<T> {
                 latent,
                 hidden,
                 actions: config.actions as usize,
-                seen: if method.is_goal_conditioned() { 2 * latent } else { latent },
+                trunk_inputs: if method.is_goal_conditioned() { 2 * latent } else { latent },
             },
         }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> PolicyDynamicsGradient<T> {
         PolicyDynamicsGradient {
             trunk: self.trunk.gradient(),
@@ -96,7 +96,7 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// A gradient by the names of the weights, without `network.` before them.
+    /// A gradient by the weights' names in a checkpoint, without the prefix `network.`.
     pub fn in_weights(&self, gradient: &PolicyDynamicsGradient<T>) -> Vec<(String, Vec<T>)> {
         let mut weights = self.trunk.in_weights("trunk", &gradient.trunk);
         for ((name, layer), gradient) in POLICY.iter().zip(&self.policy).zip(&gradient.policy) {
@@ -123,21 +123,21 @@ impl<T: Element> PolicyDynamics<T> {
 
     /// Buffers for blocks of up to R = `rows` samples.
     pub fn buffers(&self, rows: usize) -> Buffers<T> {
-        let Sizes { latent, hidden, actions, seen } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
         Buffers {
             gates: Scratch::new(),
-            wide: zeros(rows * seen.max(hidden + actions)),
+            wide: zeros(rows * trunk_inputs.max(hidden + actions)),
             narrow: zeros(rows * latent.max(hidden)),
         }
     }
 
-    /// The trunk: features of x and x_g, `[R, Z]`, left on the tape.
+    /// The trunk: records features of x and x_g, `[R, Z]`, on the tape.
     pub fn features(&self, rows: usize, step: &mut StepTape<T>, x: &[T], x_g: &[T]) {
-        let Sizes { latent, seen, .. } = self.sizes;
-        for (r, input) in step.trunk.x(rows).chunks_exact_mut(seen).enumerate() {
+        let Sizes { latent, trunk_inputs, .. } = self.sizes;
+        for (r, input) in step.trunk.x(rows).chunks_exact_mut(trunk_inputs).enumerate() {
             let row = r * latent..(r + 1) * latent;
             input[..latent].copy_from_slice(&x[row.clone()]);
-            if seen > latent {
+            if trunk_inputs > latent {
                 input[latent..].copy_from_slice(&x_g[row]);
             }
         }
@@ -146,7 +146,7 @@ impl<T: Element> PolicyDynamics<T> {
         relu(features);
     }
 
-    /// The policy branch: an action, `[R, A]`, from the features on the tape.
+    /// The policy branch: the proposed action, `[R, A]`, from the features on the tape.
     pub fn policy(&self, rows: usize, step: &mut StepTape<T>, action: &mut [T]) {
         let [first, second] = &mut step.policy;
         first.x(rows).copy_from_slice(&step.features[..rows * self.sizes.hidden]);
@@ -159,7 +159,7 @@ impl<T: Element> PolicyDynamics<T> {
         step.proposed[..action.len()].copy_from_slice(action);
     }
 
-    /// The dynamics branch: the next state in place of x, `[R, Z]`, by an action, `[R, A]`, and the features on the tape.
+    /// The dynamics branch: replaces x, `[R, Z]`, by the next state, from an action, `[R, A]`, and the features on the tape.
     pub fn next(&self, rows: usize, step: &mut StepTape<T>, action: &[T], x: &mut [T], buffers: &mut Buffers<T>) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
         let Sizes { latent, hidden, actions, .. } = self.sizes;
@@ -167,6 +167,7 @@ impl<T: Element> PolicyDynamics<T> {
             input[..hidden].copy_from_slice(&step.features[r * hidden..][..hidden]);
             input[hidden..].copy_from_slice(&action[r * actions..][..actions]);
         }
+
         layers[0].forward(rows, first, second.x(rows));
         relu(second.x(rows));
         let change = &mut buffers.narrow[..rows * latent];
@@ -174,7 +175,7 @@ impl<T: Element> PolicyDynamics<T> {
         add(x, change);
     }
 
-    /// The gradient in state and action: from x̄ after the step, `[R, Z]`, to x̄ before it, in place, unless `is_first`, and to ā,
+    /// The gradient in state and action: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless `is_first`, and writes ā,
     /// `[R, A]`.
     pub fn vjp(
         &self,
@@ -186,9 +187,9 @@ impl<T: Element> PolicyDynamics<T> {
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
-        let Sizes { latent, hidden, actions, seen } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
 
-        // The dynamics branch, to features and action.
+        // Backward through the dynamics branch, to features and action.
         second.y_bar(rows).copy_from_slice(x_bar);
         first.y_bar(rows).fill(T::ZERO);
         layers[1].vjp(rows, second, &mut buffers.gates, first.y_bar(rows));
@@ -205,17 +206,17 @@ impl<T: Element> PolicyDynamics<T> {
             return;
         }
 
-        // The trunk, to the state.
+        // Backward through the trunk, to the state.
         relu_mask(features_bar, &step.features);
-        let wide = &mut buffers.wide[..rows * seen];
+        let wide = &mut buffers.wide[..rows * trunk_inputs];
         wide.fill(T::ZERO);
         self.trunk.vjp(rows, &mut step.trunk, &mut buffers.gates, wide);
-        for (x_bar, row) in x_bar.chunks_exact_mut(latent).zip(wide.chunks_exact(seen)) {
+        for (x_bar, row) in x_bar.chunks_exact_mut(latent).zip(wide.chunks_exact(trunk_inputs)) {
             add(x_bar, &row[..latent]);
         }
     }
 
-    /// The tangent of the next state, in place of ẋ, `[R, Z]`, by ȧ, `[R, A]`. At the first step ẋ is 0.
+    /// The tangent of the next state: replaces ẋ, `[R, Z]`, from ȧ, `[R, A]`. At the first step ẋ is 0.
     pub fn jvp(
         &self,
         rows: usize,
@@ -226,14 +227,15 @@ impl<T: Element> PolicyDynamics<T> {
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
-        let Sizes { latent, hidden, actions, seen } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
 
         // The trunk.
         let features_dot = &mut buffers.narrow[..rows * hidden];
         if is_first {
             features_dot.fill(T::ZERO);
         } else {
-            for (input, x_dot) in step.trunk.x_dot(rows).chunks_exact_mut(seen).zip(x_dot.chunks_exact(latent)) {
+            for (input, x_dot) in step.trunk.x_dot(rows).chunks_exact_mut(trunk_inputs).zip(x_dot.chunks_exact(latent))
+            {
                 input[..latent].copy_from_slice(x_dot);
                 input[latent..].fill(T::ZERO);
             }
@@ -255,7 +257,7 @@ impl<T: Element> PolicyDynamics<T> {
         add(x_dot, change);
     }
 
-    /// The gradient of Φ: from x̂ after the step, `[R, Z]`, to x̂ before it, in place; adds to x̂_g, to â, `[R, A]`, and to the
+    /// The gradient of Φ: replaces x̂ after the step, `[R, Z]`, by x̂ before it, and adds to x̂_g, to â, `[R, A]`, and to the
     /// weights' gradient.
     pub fn double_backward(
         &self,
@@ -266,12 +268,12 @@ impl<T: Element> PolicyDynamics<T> {
         gradient: &mut PolicyDynamicsGradient<T>,
         buffers: &mut Buffers<T>,
     ) {
-        let Sizes { latent, hidden, actions, seen } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
         let features_hat = &mut buffers.narrow[..rows * hidden];
         features_hat.fill(T::ZERO);
         let gates = &mut buffers.gates;
 
-        // The dynamics branch, to features and action.
+        // Backward through the dynamics branch, to features and action.
         if let (Some(order), Some(layers), Some([first, second]), Some(gradients)) =
             (branches.dynamics, &self.dynamics, &mut step.dynamics, &mut gradient.dynamics)
         {
@@ -288,7 +290,7 @@ impl<T: Element> PolicyDynamics<T> {
             }
         }
 
-        // The policy branch, to the features.
+        // Backward through the policy branch, to the features.
         if branches.policy {
             let [first, second] = &mut step.policy;
             let proposed = step.proposed.iter().zip(&*hat.action);
@@ -308,14 +310,14 @@ impl<T: Element> PolicyDynamics<T> {
             self.policy[0].double_backward(rows, Order::First, first, gates, features_hat, &mut gradient.policy[0]);
         }
 
-        // The trunk, to the state and the goal.
+        // Backward through the trunk, to state and goal.
         relu_mask(features_hat, &step.features);
         step.trunk.y_hat(rows).copy_from_slice(features_hat);
-        let wide = &mut buffers.wide[..rows * seen];
+        let wide = &mut buffers.wide[..rows * trunk_inputs];
         wide.fill(T::ZERO);
         self.trunk.double_backward(rows, branches.trunk, &mut step.trunk, gates, wide, &mut gradient.trunk);
         let rows_of = hat.x.chunks_exact_mut(latent).zip(hat.x_g.chunks_exact_mut(latent));
-        for ((x_hat, x_g_hat), row) in rows_of.zip(wide.chunks_exact(seen)) {
+        for ((x_hat, x_g_hat), row) in rows_of.zip(wide.chunks_exact(trunk_inputs)) {
             add(x_hat, &row[..latent]);
             add(x_g_hat, &row[latent..]);
         }
@@ -331,17 +333,17 @@ impl<T: Element> PolicyDynamicsGradient<T> {
     }
 }
 
-/// Branches of a step that the outer loop differentiates through, and the order of each.
+/// Branches of a step in a double backward pass, with their orders.
 #[derive(Debug, Clone, Copy)]
 pub struct Branches {
     pub trunk: Order,
-    /// None if nothing depends on the next state.
+    /// `None` if nothing depends on the next state.
     pub dynamics: Option<Order>,
-    /// True if the policy proposed the action; its order is the first.
+    /// True if the policy proposed the action; its pass is of the first order.
     pub policy: bool,
 }
 
-/// Gradients of Φ that a step takes from its end to its beginning.
+/// Gradients of Φ in a step's state, goal and action.
 #[derive(Debug)]
 pub struct Cotangents<'a, T> {
     /// x̂ `[R, Z]`.

@@ -1,4 +1,4 @@
-//! Weights of a checkpoint.
+//! Tensors of a checkpoint as a source of weights.
 
 use crate::archive::{Scalar, Tensors};
 use crate::engine::layers::linear::Weights;

@@ -1,4 +1,4 @@
-//! Planning: the rollout of g_θ, and the planner that searches over it.
+//! Planning: rollouts of g_θ, and the planner, which searches over them.
 
 pub mod planner;
 pub mod rollout;

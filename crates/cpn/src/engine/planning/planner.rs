@@ -1,4 +1,4 @@
-//! The planner: plans without a graph, in memory that is kept from plan to plan.
+//! Planner of the native engine, without an autograd graph, with memory that is reused from plan to plan.
 
 use super::worker::{BLOCK, Dynamics, Worker};
 use crate::config::{Input, ModelConfig};
@@ -12,8 +12,8 @@ use crate::search::searcher::{Chunks, Searcher, par_chunks};
 use crate::search::{Plan, Query, Search};
 use std::sync::Arc;
 
-/// A learned method as it is served: its weights laid out for planning, in float32. Its plans are those of autograd from the same
-/// weights, within rounding; each plan comes out the same, bit for bit, alone or among others.
+/// A learned method, with weights packed for planning, in float32. Its plans equal those of autograd with the same weights, within
+/// rounding errors. A plan is bit for bit independent of the rest of the batch.
 #[derive(Debug)]
 pub struct Planner {
     config: ModelConfig,
@@ -22,7 +22,7 @@ pub struct Planner {
 }
 
 impl Planner {
-    /// A planner of a model on `threads` threads, at least one, with images embedded in this precision.
+    /// A planner of a valid model on `threads` threads, at least one, with images embedded in `precision`.
     pub fn new(model: &Model, precision: Precision, threads: usize) -> Self {
         let Model { config, weights } = model;
         let dynamics = Arc::new(Dynamics::new(config, weights));

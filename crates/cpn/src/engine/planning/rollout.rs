@@ -1,4 +1,4 @@
-//! The inner loop's rollout of g_θ, its distance to the goal, and the gradient of that distance in the actions.
+//! Rollout of g_θ in the inner loop, with the inner loss and its gradient in the actions.
 
 use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics, StepTape};
 use crate::engine::simd::element::Element;
@@ -9,9 +9,9 @@ use crate::search::block::{Actions, Purpose};
 pub struct Rollout<T> {
     /// Tapes of the H steps.
     pub steps: Vec<StepTape<T>>,
-    /// x_H - x_g, `[R, Z]`.
+    /// Goal error x_H - x_g, `[R, Z]`.
     pub goal_error: Vec<T>,
-    /// The inner loss' gradient in the actions, `[H, R, A]`.
+    /// Gradient of the inner loss in the actions, `[H, R, A]`.
     pub gradient: Vec<T>,
 }
 
@@ -25,8 +25,8 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// The states along the actions, `[H, R, A]`, in place of x, `[R, Z]`, and the error towards x_g, `[R, Z]`. Proposed actions
-    /// are written to `actions`. For its loss alone the steps share a tape, which stays in the caches.
+    /// Rolls out along the actions, `[H, R, A]`: replaces x, `[R, Z]`, by x_H, and sets the goal error to x_g, `[R, Z]`. Proposed
+    /// actions are written to `actions`. For [`Purpose::Loss`] the steps share a tape, which stays in the caches.
     pub fn forward(
         &mut self,
         network: &PolicyDynamics<T>,
@@ -55,8 +55,8 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// The gradient in the actions of the Huber loss (δ = 1) between x_H and x_g, left in [`Self::gradient`]. `x_bar`, `[R, Z]`, is
-    /// a buffer for the gradients in the states.
+    /// The gradient of the Huber loss (δ = 1) between x_H and x_g in the actions, written to [`Self::gradient`]. `x_bar`, `[R, Z]`,
+    /// is a buffer for the gradients in the states.
     pub fn vjp(&mut self, network: &PolicyDynamics<T>, x_bar: &mut [T], buffers: &mut Buffers<T>) {
         let rows = x_bar.len() / network.sizes.latent;
         for (x_bar, error) in x_bar.iter_mut().zip(&self.goal_error) {
@@ -69,19 +69,19 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// The inner loss of each of the R samples, summed over the latent.
+    /// Inner losses, `[R]`, summed over the latent.
     pub fn losses(&self, network: &PolicyDynamics<T>, rows: usize) -> impl Iterator<Item = T> {
         self.goal_error.chunks_exact(network.sizes.latent).take(rows).map(huber_loss)
     }
 }
 
-/// The Huber loss with δ = 1, summed: |e| - 1/2 beyond 1, e²/2 within.
+/// The sum of Huber losses with δ = 1: |e| - 1/2 for |e| > 1, else e²/2.
 fn huber_loss<T: Element>(errors: &[T]) -> T {
     let half = T::ONE / (T::ONE + T::ONE);
     errors.iter().map(|error| huber_grad(*error) * (*error - half * huber_grad(*error))).sum()
 }
 
-/// The derivative of the Huber loss with δ = 1: the error, clamped to [-1, 1].
+/// The derivative of the Huber loss with δ = 1: the error clamped to [-1, 1].
 pub fn huber_grad<T: Element>(error: T) -> T {
     if error > T::ONE {
         T::ONE

@@ -1,4 +1,4 @@
-//! A thread's memory for plans.
+//! Memory of a planning thread.
 
 use super::rollout::Rollout;
 use crate::config::ModelConfig;
@@ -10,22 +10,23 @@ use crate::search::Query;
 use crate::search::block::{Actions, PlanBlock, Purpose};
 use std::sync::Arc;
 
-/// R, the plans of a block: with more of them weights are read less often, with fewer the passes' intermediates lie nearer.
+/// Maximum R, the number of plans in a block: more read the weights less often, and fewer keep the passes' intermediates in nearer
+/// caches.
 pub const BLOCK: usize = 16;
 
 /// g_θ with the settings of its inner loop.
 #[derive(Debug)]
 pub struct Dynamics<T> {
     pub network: PolicyDynamics<T>,
-    /// α.
+    /// α, the step size of the inner loop.
     pub step_size: T,
-    /// H.
+    /// H, the planning horizon.
     pub horizon: usize,
-    /// True if the method plans, false if it is a policy alone.
+    /// True if the method plans, false for a policy.
     pub plans: bool,
 }
 
-/// One thread's memory.
+/// Memory of a thread: a block of plans, and the tapes of its passes.
 #[derive(Debug)]
 pub struct Worker<T: Element> {
     pub tape: EncoderTape<T>,
@@ -36,9 +37,9 @@ pub struct Worker<T: Element> {
     x: Vec<T>,
     /// `[R, Z]`.
     x_g: Vec<T>,
-    /// Actions by step, then row, `[H, R, A]`.
+    /// Actions, `[H, R, A]`.
     actions: Vec<T>,
-    /// Identity of the descent that the last rollout belongs to.
+    /// Identity of the descent of the last rollout.
     resident: Option<u64>,
 }
 
@@ -71,7 +72,7 @@ impl<T: Element> Worker<T> {
         }
     }
 
-    /// Start of action t of plan r of R = `rows`, of A numbers.
+    /// Index of action t, `[A]`, of plan r of R = `rows`.
     fn offset(&self, rows: usize, t: usize, r: usize) -> usize {
         (t * rows + r) * self.dynamics.network.sizes.actions
     }

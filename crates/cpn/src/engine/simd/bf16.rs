@@ -1,4 +1,4 @@
-//! Pairs of bfloat16, the upper half of a float32: an operand that some processors multiply twice as many numbers of.
+//! Pairs of bfloat16, the upper half of a float32: an operand with twice the throughput of float32 on processors with AVX512-BF16.
 
 #![expect(unsafe_code, reason = "instructions that not every processor has")]
 
@@ -19,12 +19,13 @@ const UPPER: u32 = 0xffff_0000;
 pub struct Bf16x2(u32);
 
 impl Bf16x2 {
-    /// AVX512-BF16, where this processor has it for registers of 512 bits.
+    /// The token of AVX512-BF16 with 512-bit registers; `None` on processors without it.
     fn instructions() -> Option<V4> {
         if is_x86_feature_detected!("avx512bf16") { V4::try_new() } else { None }
     }
 
-    /// True where pairs are multiplied faster than float32: without the instructions it takes several others.
+    /// True on processors with AVX512-BF16, where pairs are multiplied faster than float32. Elsewhere a product takes several
+    /// instructions.
     pub fn is_fast() -> bool {
         Self::instructions().is_some()
     }
@@ -60,7 +61,7 @@ impl Operand for Bf16x2 {
         simd.mul_add_f32s(lower(a), lower(b), simd.mul_add_f32s(upper(a), upper(b), c))
     }
 
-    /// Registers of 512 bits only with the instructions for them.
+    /// 512-bit registers only with AVX512-BF16, as `dot_add` requires.
     #[inline(always)]
     fn dispatch<W: WithSimd>(kernel: W) -> W::Output {
         match (Self::instructions(), V3::try_new()) {
@@ -84,24 +85,24 @@ impl Operand for Bf16x2 {
     }
 }
 
-/// a b + c in registers of 512 bits, both products of each pair.
+/// a b + c in 512-bit registers, with both products of each pair.
 #[inline(always)]
 fn dot_add(a: [u32; 16], b: [u32; 16], c: [f32; 16]) -> [f32; 16] {
-    // SAFETY: all are 512 bits, any of which are numbers; only `run_native` gives such registers to a kernel of pairs.
+    // SAFETY: all types have 512 bits and no invalid values; only `run_native` calls a kernel of pairs with such registers.
     unsafe {
         let [a, b] = [transmute::<[u32; 16], __m512bh>(a), transmute::<[u32; 16], __m512bh>(b)];
         transmute::<__m512, [f32; 16]>(_mm512_dpbf16_ps(transmute::<[f32; 16], __m512>(c), a, b))
     }
 }
 
-/// Runs a kernel with the instructions of [`V4`] and those for bfloat16.
+/// Runs a kernel with the instructions of [`V4`] and AVX512-BF16.
 #[target_feature(enable = "avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512bf16,fma,bmi1,bmi2,lzcnt,popcnt")]
 fn run_native<W: WithSimd>(simd: V4, kernel: W) -> W::Output {
     kernel.with_simd(simd)
 }
 
-/// Rounding to bfloat16: the nearest in the upper half, ties away from zero, and anything in the lower. A NaN that an operation
-/// left stays one.
+/// Rounding to the nearest bfloat16, in the upper half, with ties away from zero; the lower half is undefined. A NaN produced by an
+/// operation stays NaN.
 #[inline(always)]
 fn rounded(number: f32) -> u32 {
     number.to_bits().wrapping_add(0x8000)
@@ -116,7 +117,7 @@ struct PackAlongK<'a> {
 impl WithSimd for PackAlongK<'_> {
     type Output = ();
 
-    // As in `PackRowPairs`, nothing names a register; the compiler finds them, as wide as the dispatch says there are.
+    // As in `PackRowPairs`, the compiler vectorises the loop for the instructions of the dispatch.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _simd: S) {
         for (half, number) in self.halves.iter_mut().zip(self.numbers) {
@@ -157,7 +158,7 @@ mod tests {
     use super::super::buffer::zeros;
     use super::*;
 
-    /// Numbers from -1 to 1, none of which fits bfloat16.
+    /// Numbers from -1 to 1, none exact in bfloat16.
     fn numbers(count: usize, seed: usize) -> Vec<f32> {
         (0..count).map(|i| ((i * 7919 + seed * 104_729) % 9973) as f32 / 4986.5 - 1.0001).collect()
     }
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn without_instructions_they_are_the_same() {
+    fn products_are_equal_with_and_without_the_instructions() {
         let (a, b) = (numbers(38, 1), numbers(38, 2));
         let mut workspaces = [zeros(0), zeros(0)];
         let [in_a, in_b] = &mut workspaces;
@@ -228,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_is_to_the_nearest_and_keeps_what_is_not_a_number() {
+    fn rounding_is_to_the_nearest_and_keeps_nan() {
         for (number, expected) in [
             (1.0, 1.0),
             (1.0 + 0.99 / 256.0, 1.0),

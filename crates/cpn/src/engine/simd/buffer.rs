@@ -2,7 +2,7 @@
 
 use aligned_vec::{AVec, avec};
 
-/// A vector that begins at the start of a cache line, so that no register is filled from two lines.
+/// A vector aligned to cache lines, so that no register is loaded from two lines.
 pub type AlignedVec<T> = AVec<T>;
 
 /// A buffer of `len` zeros.
@@ -10,7 +10,7 @@ pub fn zeros<T: Copy + Default>(len: usize) -> AlignedVec<T> {
     avec![T::default(); len]
 }
 
-/// The first `len` elements of a buffer, which grows, filled up with zeros, if it is shorter; it never shrinks.
+/// The first `len` elements of a buffer. A shorter buffer grows, with zeros; it never shrinks.
 pub fn resize<T: Copy + Default>(buffer: &mut AlignedVec<T>, len: usize) -> &mut [T] {
     if buffer.len() < len {
         buffer.resize(len, T::default());

@@ -1,5 +1,5 @@
-//! Element types: [`Operand`], the factor of a matrix product, and [`Element`], a floating-point number: float32 in use, float64
-//! for gradient checks.
+//! Element types: [`Operand`], the factor of a matrix product, and [`Element`], a floating-point number: float32, and float64 for
+//! gradient checks.
 
 use super::buffer::AlignedVec;
 use pulp::{Arch, Simd, WithSimd};
@@ -7,21 +7,21 @@ use std::fmt::Debug;
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
-/// The operand type of matrix products: one number, or a [pair of bfloat16](super::bf16), and registers full of them. With PACK
-/// numbers in an operand, a product's inner dimension is shorter by that factor.
+/// Operand of matrix products: one number, or a [pair of bfloat16](super::bf16), with its register type. An operand of PACK numbers
+/// divides a product's inner dimension by PACK.
 pub trait Operand: Copy + Debug + Default + PartialEq + Send + Sync + 'static {
-    /// The type that products are accumulated in.
+    /// Type of the accumulated products.
     type Sum: Element;
-    /// A register, with as many operands as a register of sums has sums.
+    /// A register of operands, as many as a register of sums has sums.
     type Register<S: Simd>: Copy + Debug;
-    /// Numbers in an operand.
+    /// Number of numbers in an operand.
     const PACK: usize;
-    /// An operand of zeros; also its `Default`, which buffers are filled with.
+    /// An operand of zeros; equal to its `Default`, which fills new buffers.
     const ZERO: Self;
 
-    /// A register of copies of one operand.
+    /// A register with all lanes equal to `value`.
     fn splat<S: Simd>(simd: S, value: Self) -> Self::Register<S>;
-    /// The first operands of a slice; zeros past its end.
+    /// Loads the first operands of a slice, with zeros past its end.
     fn load<S: Simd>(simd: S, slice: &[Self]) -> Self::Register<S>;
     /// a b + c; for packed operands the sum of all PACK products.
     fn mul_add<S: Simd>(
@@ -31,7 +31,7 @@ pub trait Operand: Copy + Debug + Default + PartialEq + Send + Sync + 'static {
         c: <Self::Sum as Operand>::Register<S>,
     ) -> <Self::Sum as Operand>::Register<S>;
 
-    /// Runs a kernel with the widest registers that the processor has for this operand.
+    /// Runs a kernel with the processor's widest registers for this operand.
     #[inline(always)]
     fn dispatch<W: WithSimd>(kernel: W) -> W::Output {
         Arch::new().dispatch(kernel)
@@ -43,7 +43,7 @@ pub trait Operand: Copy + Debug + Default + PartialEq + Send + Sync + 'static {
     fn pack_row_pairs<'a>(numbers: &'a [Self::Sum], columns: usize, workspace: &'a mut AlignedVec<Self>) -> &'a [Self];
 }
 
-/// A floating-point number, and registers full of it.
+/// A floating-point number with its register type.
 pub trait Element:
     Operand<Sum = Self>
     + PartialOrd
@@ -56,16 +56,16 @@ pub trait Element:
     + SubAssign
     + Sum
 {
-    /// The coarser operand that products may take in its place.
+    /// Operand of lower precision for products.
     type Half: Operand<Sum = Self>;
     /// 1.
     const ONE: Self;
 
-    /// A count as a number.
+    /// Conversion of a count.
     fn count(n: usize) -> Self;
-    /// A byte as a number.
+    /// Conversion of a byte.
     fn from_u8(value: u8) -> Self;
-    /// The nearest number.
+    /// Conversion to the nearest number.
     fn from_f64(value: f64) -> Self;
     /// The hyperbolic tangent.
     fn tanh(self) -> Self;
@@ -74,9 +74,9 @@ pub trait Element:
     /// The logistic sigmoid, 1 / (1 + e^-x).
     fn sigmoid(self) -> Self;
 
-    /// Writes to the beginning of a slice, up to its end.
+    /// Stores a register at the beginning of a slice, truncated to the slice's length.
     fn store<S: Simd>(simd: S, slice: &mut [Self], register: Self::Register<S>);
-    /// The whole registers that a slice fills; the rest is left out.
+    /// The slice as registers, without the remainder.
     fn registers<S: Simd>(simd: S, slice: &[Self]) -> &[Self::Register<S>];
     /// Mutable [`Self::registers`].
     fn registers_mut<S: Simd>(simd: S, slice: &mut [Self]) -> &mut [Self::Register<S>];
@@ -86,7 +86,7 @@ pub trait Element:
     fn sub_registers<S: Simd>(simd: S, a: Self::Register<S>, b: Self::Register<S>) -> Self::Register<S>;
     /// a b.
     fn mul_registers<S: Simd>(simd: S, a: Self::Register<S>, b: Self::Register<S>) -> Self::Register<S>;
-    /// The larger of a and b; b where one is not a number.
+    /// The maximum of a and b; b if either is NaN.
     fn max_registers<S: Simd>(simd: S, a: Self::Register<S>, b: Self::Register<S>) -> Self::Register<S>;
     /// The horizontal sum of a register.
     fn sum_register<S: Simd>(simd: S, register: Self::Register<S>) -> Self;

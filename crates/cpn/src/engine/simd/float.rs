@@ -5,7 +5,7 @@ use super::buffer::AlignedVec;
 use super::element::{Element, Operand};
 use pulp::Simd;
 
-/// The methods of [`Element`] that differ only in the names of pulp's functions.
+/// Methods of [`Element`] in terms of pulp's functions for a type.
 macro_rules! element {
     ($float:ident, $register:ident, $count:ident, $as_simd:ident, $as_mut_simd:ident, $partial_store:ident, $add:ident, $sub:ident,
      $mul:ident, $max:ident, $sum:ident) => {
@@ -86,7 +86,7 @@ macro_rules! element {
     };
 }
 
-/// A number as its own operand: packing leaves it as it is.
+/// A number as its own operand; packing is the identity.
 macro_rules! operand {
     ($float:ident, $register:ident, $count:ident, $splat:ident, $as_simd:ident, $partial_load:ident, $mul_add:ident) => {
         impl Operand for $float {
@@ -128,7 +128,7 @@ operand!(f64, f64s, F64_LANES, splat_f64s, as_simd_f64s, partial_load_f64s, mul_
 operand!(f32, f32s, F32_LANES, splat_f32s, as_simd_f32s, partial_load_f32s, mul_add_f32s);
 
 impl Element for f64 {
-    /// Itself: float64 is there for checks.
+    /// Float64 itself: the type serves gradient checks only.
     type Half = Self;
     element!(
         f64,
@@ -146,7 +146,7 @@ impl Element for f64 {
 
     #[inline(always)]
     fn sigmoid_register<S: Simd>(simd: S, register: S::f64s) -> S::f64s {
-        // The widest registers hold eight; this is only for checks.
+        // The widest registers hold eight; speed is irrelevant in gradient checks.
         let mut values = [0.0; 8];
         simd.partial_store_f64s(&mut values[..S::F64_LANES], register);
         simd.partial_load_f64s(&values.map(Element::sigmoid)[..S::F64_LANES])
@@ -169,27 +169,27 @@ impl Element for f32 {
         reduce_sum_f32s
     );
 
-    /// The sigmoid to about two units in the last place: e^-x is 2^n times a polynomial of the rest, which lies within half a
-    /// power of two (minimax in the relative error, by Lawson's iteration).
+    /// The sigmoid, to about two units in the last place: e^-x = 2^n p(r), with n = round(-x log2 e), |r| ≤ 1/2, and a polynomial
+    /// p that is minimax in the relative error (by Lawson's iteration).
     #[inline(always)]
     fn sigmoid_register<S: Simd>(simd: S, register: S::f32s) -> S::f32s {
         let splat = |value: f32| simd.splat_f32s(value);
 
-        // Range reduction. Beyond ±88 float32 has neither room nor digits; the sigmoid is 0 or 1 long before. NaN stays NaN.
+        // Range reduction. Beyond ±88 e^-x leaves the range of float32, and the sigmoid has long rounded to 0 or 1. NaN stays NaN.
         let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-88.0), register));
-        // Adding this rounds to a whole number, which then stands in the low bits, as an exponent does: 127 above.
+        // Adding ROUND rounds to an integer, in the low bits of the sum, with the exponent's bias of 127.
         const ROUND: f32 = 12_582_912.0 + 127.0;
         let log2_e = splat(-std::f32::consts::LOG2_E);
         let shifted = simd.mul_add_f32s(x, log2_e, splat(ROUND));
         let rest = simd.mul_add_f32s(x, log2_e, simd.sub_f32s(splat(ROUND), shifted));
 
-        // 2 to the rest, within 1.1e-7: a minimax polynomial.
+        // 2^r, with a relative error of at most 1.1e-7.
         let mut power = splat(1.330_06e-3);
         for coefficient in [9.669_69e-3, 5.550_558e-2, 2.402_228_2e-1, std::f32::consts::LN_2, 1.0] {
             power = simd.mul_add_f32s(power, rest, splat(coefficient));
         }
 
-        // 2^n: the shift drops the higher bits.
+        // 2^n: the shift moves the biased integer into the exponent and drops the higher bits.
         let exponent = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(23));
         let scale = simd.transmute_f32s_u32s(exponent);
         simd.div_f32s(splat(1.0), simd.mul_add_f32s(power, scale, splat(1.0)))
@@ -224,7 +224,7 @@ mod tests {
         let mut exact: Vec<f64> = inputs.iter().copied().map(f64::from).collect();
         Arch::new().dispatch(Sigmoids(&mut exact));
         for ((x, ours), exact) in inputs.iter().zip(ours).zip(exact) {
-            // The last place of x moves its sigmoid by more than the second.
+            // The second term is the rounding error of log2 e; the last place of x changes the sigmoid by more.
             let tolerance = 3e-7 + 1.5e-8 * f64::from(x.abs());
             assert!((f64::from(ours) - exact).abs() < tolerance * exact, "sigmoid({x}): {ours} for {exact}");
             assert!((1.0 / (1.0 + (-f64::from(*x)).exp()) - exact).abs() <= 1e-15 * exact, "sigmoid({x})");

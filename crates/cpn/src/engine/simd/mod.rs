@@ -1,4 +1,4 @@
-//! Registers of the processor: element types, vectors as wide as there are registers for, aligned buffers, bfloat16.
+//! SIMD: element types, vectors of the processor's width, aligned buffers, bfloat16.
 
 pub mod bf16;
 pub mod buffer;

@@ -1,4 +1,4 @@
-//! Vectors: registers with arithmetic, as wide as the processor has them.
+//! Vectors: registers with arithmetic, of the processor's width.
 
 use super::element::{Element, Operand};
 use pulp::{Arch, Simd, WithSimd};
@@ -25,7 +25,7 @@ pub fn registers_mut<S: Simd, T: Element, const N: usize>(
     slices.map(|slice| &mut T::registers_mut(simd, slice)[..count])
 }
 
-/// `sum += x`, element by element.
+/// Elementwise `sum += x`.
 pub fn add<T: Element>(sum: &mut [T], x: &[T]) {
     Arch::new().dispatch(AddAssign { sum, x });
 }
@@ -48,20 +48,20 @@ impl<T: Element> WithSimd for AddAssign<'_, T> {
     }
 }
 
-/// The register shape of this processor for an operand type.
+/// Shape of the processor's registers for an operand type.
 #[derive(Debug, Clone, Copy)]
 pub struct VectorShape {
-    /// Operands, or sums, in a register.
+    /// Number of operands, or sums, in a register.
     pub lanes: usize,
     /// Number of registers.
     pub registers: usize,
 }
 
 impl VectorShape {
-    /// The shape that [`Operand::dispatch`] chooses.
+    /// The shape chosen by [`Operand::dispatch`].
     pub fn of<E: Operand>() -> Self {
-        struct Ask<E>(PhantomData<E>);
-        impl<E: Operand> WithSimd for Ask<E> {
+        struct Shape<E>(PhantomData<E>);
+        impl<E: Operand> WithSimd for Shape<E> {
             type Output = VectorShape;
 
             #[inline(always)]
@@ -69,11 +69,11 @@ impl VectorShape {
                 VectorShape { lanes: size_of::<E::Register<S>>() / size_of::<E>(), registers: S::REGISTER_COUNT }
             }
         }
-        E::dispatch(Ask::<E>(PhantomData))
+        E::dispatch(Shape::<E>(PhantomData))
     }
 }
 
-/// A register of numbers.
+/// A register of numbers, with arithmetic.
 #[derive(Debug)]
 pub struct Vector<S: Simd, T: Element> {
     simd: S,
@@ -90,22 +90,22 @@ impl<S: Simd, T: Element> Clone for Vector<S, T> {
 impl<S: Simd, T: Element> Copy for Vector<S, T> {}
 
 impl<S: Simd, T: Element> Vector<S, T> {
-    /// Numbers in a vector.
+    /// Number of numbers in a vector.
     pub const COUNT: usize = size_of::<T::Register<S>>() / size_of::<T>();
 
-    /// A vector of copies of one number.
+    /// A vector with all lanes equal to `value`.
     #[inline(always)]
     pub fn splat(simd: S, value: T) -> Self {
         Self { simd, register: T::splat(simd, value) }
     }
 
-    /// The first numbers of a slice; zeros past its end.
+    /// Loads the first numbers of a slice, with zeros past its end.
     #[inline(always)]
     pub fn load(simd: S, slice: &[T]) -> Self {
         Self { simd, register: T::load(simd, slice) }
     }
 
-    /// Several registers as vectors.
+    /// Registers as vectors.
     #[inline(always)]
     pub fn from_registers<const N: usize>(simd: S, registers: [T::Register<S>; N]) -> [Self; N] {
         let mut vectors = [Self::splat(simd, T::ZERO); N];
@@ -124,7 +124,7 @@ impl<S: Simd, T: Element> Vector<S, T> {
     /// [`Self::load`] of each slice.
     #[inline(always)]
     pub fn load_each<const N: usize>(simd: S, slices: [&[T]; N]) -> [Self; N] {
-        // A loop, for the closure of a `map` is not always made part of the kernel.
+        // A loop, since the closure of a `map` is not always inlined into the kernel.
         let mut vectors = [Self::splat(simd, T::ZERO); N];
         for (vector, slice) in vectors.iter_mut().zip(slices) {
             *vector = Self::load(simd, slice);
@@ -132,31 +132,31 @@ impl<S: Simd, T: Element> Vector<S, T> {
         vectors
     }
 
-    /// Writes to the beginning of a slice, up to its end.
+    /// Stores at the beginning of a slice, truncated to the slice's length.
     #[inline(always)]
     pub fn store(self, slice: &mut [T]) {
         T::store(self.simd, slice, self.register);
     }
 
-    /// Adds to the beginning of a slice, up to its end.
+    /// Adds to the beginning of a slice, truncated to the slice's length.
     #[inline(always)]
     pub fn add_to(self, slice: &mut [T]) {
         (Self::load(self.simd, slice) + self).store(slice);
     }
 
-    /// `self * factor + summand`, rounded once.
+    /// Fused `self * factor + summand`.
     #[inline(always)]
     pub fn mul_add(self, factor: Self, summand: Self) -> Self {
         Self { register: T::mul_add(self.simd, self.register, factor.register, summand.register), ..self }
     }
 
-    /// `self` + a b, of operands.
+    /// `self` + a b, for registers of operands.
     #[inline(always)]
     pub fn add_product<E: Operand<Sum = T>>(self, a: E::Register<S>, b: E::Register<S>) -> Self {
         Self { register: E::mul_add(self.simd, a, b, self.register), ..self }
     }
 
-    /// The rectified linear unit of each number; NaN stays NaN, so that it is seen.
+    /// The rectified linear unit of each number; NaN stays NaN, so that it is detected.
     #[inline(always)]
     pub fn relu(self) -> Self {
         Self { register: T::max_registers(self.simd, T::splat(self.simd, T::ZERO), self.register), ..self }
@@ -237,7 +237,7 @@ mod tests {
         }
     }
 
-    /// A register holds between one number and sixteen; slices that end within one are filled up with zeros.
+    /// A register holds 1 to 16 numbers; a shorter slice is padded with zeros.
     #[test]
     fn arithmetic_is_by_element() {
         for len in 1..17 {
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn not_a_number_stays_so_through_the_unit() {
+    fn relu_keeps_nan() {
         let [mut product, mut relu, mut sum] = [[0.0f32]; 3];
         let results = [&mut product[..], &mut relu, &mut sum];
         Arch::new().dispatch(Arithmetic { a: &[f32::NAN], b: &[1.0], results });

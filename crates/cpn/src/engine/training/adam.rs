@@ -1,4 +1,4 @@
-//! The Adam optimiser (Kingma and Ba, 2015), in place on a model's weights.
+//! Adam optimiser (Kingma and Ba, 2015), in place on a model's weights.
 
 use crate::archive::{Tensor, Tensors};
 use crate::engine::layers::linear::Weights;
@@ -9,7 +9,7 @@ const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-8;
 
-/// Weights with the running moments of their gradients.
+/// Weights, with the first and second moments of their gradients.
 #[derive(Debug)]
 pub struct Adam {
     weights: BTreeMap<String, Weight>,
@@ -37,8 +37,7 @@ impl Adam {
         Self { weights: weights.iter().map(weight).collect(), steps: 0 }
     }
 
-    /// Updates the weights that the gradient knows, by the gradient or, if its norm is more than `max_norm`, by one of that norm.
-    /// Returns the norm before clipping.
+    /// Updates the weights that have a gradient, clipped to the norm `max_norm`. Returns the norm over all weights before clipping.
     pub fn step(&mut self, gradient: &BTreeMap<String, Vec<f32>>, learning_rate: f64, max_norm: f64) -> f64 {
         let squares = gradient.values().map(|gradient| squared_norm(gradient));
         let norm = squares.sum::<f64>().sqrt();
@@ -67,7 +66,7 @@ impl Adam {
         self.weights.iter().map(|(name, weight)| (name.clone(), Tensor::new(&weight.shape, &weight.value))).collect()
     }
 
-    /// Weights and moments by name.
+    /// Weights and moments, as [`Learner::state`](crate::Learner::state).
     pub fn state(&self) -> Tensors {
         let parts = |(name, weight): (&String, &Weight)| {
             let Weight { shape, value, mean, square } = weight;
@@ -77,10 +76,10 @@ impl Adam {
         self.weights.iter().flat_map(parts).collect()
     }
 
-    /// Restores an [`Adam::state`] of `steps` updates.
+    /// Restores an [`Adam::state`] after `steps` updates.
     ///
     /// # Errors
-    /// Names the tensor that is missing or of another shape.
+    /// The first tensor that is missing, or of another shape or type.
     pub fn restore(&mut self, state: &Tensors, steps: u32) -> Result<(), LearnerError> {
         for (name, Weight { shape, value, mean, square }) in &mut self.weights {
             for (part, values) in [("weight", value), ("mean", mean), ("square", square)] {
@@ -100,7 +99,7 @@ impl Weights<f32> for Adam {
     }
 }
 
-/// In sums side by side, which the compiler vectorises, each in the same order every time.
+/// The squared norm, by parallel sums that the compiler vectorises, in a fixed order.
 fn squared_norm(gradient: &[f32]) -> f64 {
     let mut sums = [0.0; 16];
     for chunk in gradient.chunks(sums.len()) {

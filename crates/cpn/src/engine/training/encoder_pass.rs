@@ -1,4 +1,4 @@
-//! The encoder's passes in training: forward over the frames of a batch, and back to its weights.
+//! Encoder's passes in training: forward over the frames of a batch, and backward to the weights.
 
 use crate::config::EncoderConfig;
 use crate::engine::layers::linear::Weights;
@@ -8,7 +8,7 @@ use crate::observation::Observed;
 use crate::precision::Precision;
 use rayon::prelude::*;
 
-/// The encoder's passes on some threads, whose tapes are kept from batch to batch.
+/// The encoder's passes on several threads, with tapes that are reused from batch to batch.
 #[derive(Debug)]
 pub struct EncoderPass<T: Element> {
     config: EncoderConfig,
@@ -18,23 +18,23 @@ pub struct EncoderPass<T: Element> {
     tapes: Vec<EncoderTape<T>>,
 }
 
-/// EmbeddedFrames frames, for the backward pass from a loss' gradient in their embeddings.
+/// Embedded frames of a batch, for the backward pass from the gradient in their embeddings.
 #[derive(Debug)]
 pub struct EmbeddedFrames<'a, T: Element> {
     encoder: &'a Encoder<T>,
     frames: Vec<Observed<'a>>,
-    /// Number of frames of a thread.
+    /// Number of frames per thread.
     share: usize,
     tapes: &'a mut [EncoderTape<T>],
 }
 
 impl<T: Element> EncoderPass<T> {
-    /// Passes of encoders of a valid configuration, on `threads` threads, at least one.
+    /// Passes of encoders with a valid configuration, on `threads` threads, at least one.
     pub fn new(config: EncoderConfig, precision: Precision, threads: usize) -> Self {
         Self { config, precision, encoder: None, tapes: (0..threads.max(1)).map(|_| EncoderTape::new()).collect() }
     }
 
-    /// Embeddings of frames by the current weights, `[F, Z]`.
+    /// Embeddings of frames with the current weights, `[F, Z]`.
     pub fn forward<'a>(
         &'a mut self,
         weights: &impl Weights<T>,
@@ -49,8 +49,8 @@ impl<T: Element> EncoderPass<T> {
 }
 
 impl<T: Element> EmbeddedFrames<'_, T> {
-    /// The gradient in each weight by its name in a checkpoint, from a loss' gradient in the embeddings, `[F, Z]`. The order of its
-    /// sums depends on nothing but the frames and the number of threads.
+    /// The gradient by the weights' names in a checkpoint, from the gradient in the embeddings, `[F, Z]`. It is deterministic for a
+    /// given number of threads.
     pub fn vjp(self, x_hat: &[T]) -> Vec<(String, Vec<T>)> {
         let Self { encoder, frames, share, tapes } = self;
         let x_hats = x_hat.par_chunks(share * encoder.latent());
@@ -63,7 +63,7 @@ impl<T: Element> EmbeddedFrames<'_, T> {
             })
             .collect();
 
-        // The sum over the threads, in their order.
+        // The sum over the threads, in a fixed order.
         let mut gradients = gradients.into_iter();
         let mut sum = gradients.next().unwrap_or_else(|| encoder.gradient());
         gradients.for_each(|gradient| sum.add(&gradient));

@@ -1,4 +1,4 @@
-//! Training steps of the native engine: loss, gradient, update.
+//! Training steps of the native engine.
 
 use super::adam::Adam;
 use super::outer_loss::OuterLoss;
@@ -20,7 +20,7 @@ pub struct NativeLearner {
 }
 
 impl NativeLearner {
-    /// Training of a model on `threads` threads, at least one, by valid settings.
+    /// A learner of a valid model on `threads` threads, at least one, with valid settings.
     pub fn new(model: Model, training: &Training, threads: usize) -> Self {
         Self {
             adam: Adam::new(&model.weights),

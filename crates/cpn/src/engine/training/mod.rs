@@ -1,4 +1,4 @@
-//! Training: the outer loss of a batch, its gradient in every weight, and the update by it.
+//! Training: the outer loss of a batch, its gradient in all weights, and the optimiser.
 
 pub mod adam;
 pub mod encoder_pass;

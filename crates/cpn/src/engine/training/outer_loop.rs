@@ -1,4 +1,4 @@
-//! The outer loop: behaviour cloning through the inner loop, and its gradient, block by block and thread by thread.
+//! Outer loop: behaviour cloning through the inner loop, with its gradient, for blocks of samples on several threads.
 
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
@@ -12,24 +12,25 @@ use crate::engine::simd::vector::add;
 use crate::search::block::{Actions, Purpose};
 use rayon::prelude::*;
 
-/// R, the samples of a block in training: more, and weights are read less often; fewer, and the passes' intermediates stay nearer.
+/// Maximum R, the number of samples in a block: more read the weights less often, and fewer keep the passes' intermediates in
+/// nearer caches.
 const BLOCK: usize = 32;
 
-/// The outer loop on some threads, in memory that is kept from batch to batch.
+/// The outer loop on several threads, with tapes that are reused from batch to batch.
 #[derive(Debug)]
 pub struct OuterLoop<T> {
     config: ModelConfig,
     threads: Vec<ThreadState<T>>,
 }
 
-/// One thread's memory.
+/// Memory of a thread.
 #[derive(Debug, Default)]
 struct ThreadState<T> {
     tapes: Option<BlockTapes<T>>,
     accumulators: Option<Accumulators<T>>,
 }
 
-/// The outer loss of a batch and its gradients.
+/// The outer loss of a batch, with its gradients.
 #[derive(Debug)]
 pub struct OuterGradient<T> {
     /// The loss.
@@ -38,7 +39,7 @@ pub struct OuterGradient<T> {
     pub x: Vec<T>,
     /// The gradient in x_g, `[B, Z]`.
     pub x_g: Vec<T>,
-    /// The gradient in each weight that takes part, by its name in a checkpoint.
+    /// The gradient by the weights' names in a checkpoint, for weights that affect the loss.
     pub weights: Vec<(String, Vec<T>)>,
 }
 
@@ -49,26 +50,26 @@ pub struct Samples<'a, T> {
     pub x: &'a [T],
     /// x_g, `[R, Z]`.
     pub x_g: &'a [T],
-    /// The demonstrated actions, `[R, H, A]`.
+    /// Demonstrated actions, `[R, H, A]`.
     pub actions: &'a [T],
-    /// The mask, 1 where the demonstration has an action, else 0, `[R, H]`.
+    /// Mask, `[R, H]`: 1 for an action within the demonstration, else 0.
     pub mask: &'a [T],
 }
 
-/// Settings of inner loop and loss.
+/// Settings of the inner loop and the loss.
 #[derive(Debug, Clone, Copy)]
 struct Settings<T> {
-    /// H.
+    /// H, the planning horizon.
     horizon: usize,
-    /// U.
+    /// U, the number of updates.
     updates: usize,
-    /// α.
+    /// α, the step size of the inner loop.
     step_size: T,
-    /// The factor of the squared errors: 1 / (A Σ mask), the sum over the whole batch.
+    /// Weight of a squared error: 1 / (A Σ mask), summed over the whole batch.
     scale: T,
 }
 
-/// Accumulated loss and gradients of a thread's rows.
+/// Accumulated loss and gradients of a thread's samples.
 #[derive(Debug)]
 struct Accumulators<T> {
     /// The outer loss.
@@ -82,12 +83,12 @@ struct Accumulators<T> {
 /// Tapes and intermediates of a block of R samples.
 #[derive(Debug)]
 struct BlockTapes<T> {
-    /// The rollout before each update; one if there is no update.
+    /// Rollouts before the updates; one for U = 0.
     rollouts: Vec<Rollout<T>>,
     buffers: Buffers<T>,
-    /// Actions by step, then row, `[H, R, A]`.
+    /// Actions, `[H, R, A]`.
     actions: Vec<T>,
-    /// The outer loss' gradient in the actions, likewise.
+    /// Gradient of the outer loss in the actions, `[H, R, A]`.
     actions_hat: Vec<T>,
     actions_dot: Vec<T>,
     /// x along the rollout, then x̄, ẋ or x̂, `[R, Z]`.
@@ -96,12 +97,12 @@ struct BlockTapes<T> {
 }
 
 impl<'a, T: Element> Samples<'a, T> {
-    /// Number of samples, given Z.
+    /// Number of samples; `latent` is Z.
     fn rows(&self, latent: usize) -> usize {
         self.x.len() / latent
     }
 
-    /// The `count` samples from `first` on, given Z.
+    /// The `count` samples from `first` on; `latent` is Z.
     fn part(&self, latent: usize, first: usize, count: usize) -> Self {
         let rows = self.rows(latent);
         let cut = |values: &'a [T]| {
@@ -113,26 +114,25 @@ impl<'a, T: Element> Samples<'a, T> {
 }
 
 impl<T: Element> OuterLoop<T> {
-    /// An outer loop for models of a valid configuration, on `threads` threads, at least one.
+    /// An outer loop for models with a valid configuration, on `threads` threads, at least one.
     pub fn new(config: ModelConfig, threads: usize) -> Self {
         let state = || ThreadState { tapes: None, accumulators: None };
         Self { config, threads: (0..threads.max(1)).map(|_| state()).collect() }
     }
 
-    /// The outer loss of a batch and its gradient. The order of its sums depends on nothing but the batch and the number of
-    /// threads.
+    /// The outer loss of a batch and its gradient, deterministic for a given number of threads.
     pub fn run(&mut self, weights: &impl Weights<T>, samples: Samples<'_, T>) -> OuterGradient<T> {
         let network = PolicyDynamics::new(&self.config, weights);
         let (horizon, updates) = (self.config.horizon as usize, self.config.updates as usize);
-        let known: T = samples.mask.iter().copied().sum();
+        let count: T = samples.mask.iter().copied().sum();
         let settings = Settings {
             horizon,
             updates,
             step_size: weights.get("step_size")[0],
-            scale: T::ONE / (known * T::count(network.sizes.actions)),
+            scale: T::ONE / (count * T::count(network.sizes.actions)),
         };
 
-        // A share of the samples for each thread, block by block.
+        // Each thread computes its share of the samples in blocks.
         let latent = network.sizes.latent;
         let (mut x, mut x_g) = (vec![T::ZERO; samples.x.len()], vec![T::ZERO; samples.x.len()]);
         let share = samples.rows(latent).div_ceil(self.threads.len());
@@ -148,7 +148,7 @@ impl<T: Element> OuterLoop<T> {
             }
         });
 
-        // The sum over the threads, in their order.
+        // The sum over the threads, in a fixed order.
         let mut parts = self.threads.iter_mut().filter_map(|thread| thread.accumulators.take());
         let mut total = parts.next().unwrap_or_else(|| Accumulators::zeros(&network));
         parts.for_each(|part| total.add(&part));
@@ -157,7 +157,7 @@ impl<T: Element> OuterLoop<T> {
 }
 
 impl<T: Element> Accumulators<T> {
-    /// Zeros.
+    /// Zero loss and gradients.
     fn zeros(network: &PolicyDynamics<T>) -> Self {
         Self { loss: T::ZERO, step_size: T::ZERO, network: network.gradient() }
     }
@@ -169,7 +169,7 @@ impl<T: Element> Accumulators<T> {
         self.network.add(&other.network);
     }
 
-    /// The gradient by the names of the weights, with α if it takes part.
+    /// The gradient by the weights' names in a checkpoint, with α for U > 0.
     fn in_weights(&self, network: &PolicyDynamics<T>, with_step_size: bool) -> Vec<(String, Vec<T>)> {
         let weights = network.in_weights(&self.network).into_iter();
         let mut weights: Vec<_> = weights.map(|(name, weight)| (format!("network.{name}"), weight)).collect();
@@ -196,7 +196,7 @@ impl<T: Element> BlockTapes<T> {
         }
     }
 
-    /// The outer loss of a block, forward and backward: adds to `accumulators`; writes x̂ and x̂_g, the loss' gradients in x and x_g,
+    /// The outer loss of a block, forward and backward: adds to `accumulators`, and writes x̂ and x̂_g, the gradients in x and x_g,
     /// `[R, Z]`.
     fn run(
         &mut self,
@@ -210,7 +210,7 @@ impl<T: Element> BlockTapes<T> {
         x_hat.fill(T::ZERO);
         x_g_hat.fill(T::ZERO);
 
-        // Plan from each x towards its x_g, and compare with the demonstration.
+        // The inner loop, and the outer loss of its plans.
         for k in 0..self.rollouts.len() {
             self.roll_out(network, settings, samples, k);
             if settings.updates > 0 {
@@ -219,7 +219,7 @@ impl<T: Element> BlockTapes<T> {
         }
         accumulators.loss += self.behaviour_cloning_loss(network.sizes, settings, samples, rows);
 
-        // Back through the updates and their rollouts.
+        // Backward through the updates and their rollouts.
         for k in (0..self.rollouts.len()).rev() {
             if settings.updates > 0 {
                 accumulators.step_size -= self.step_size_hat(network.sizes, rows, k);
@@ -232,7 +232,7 @@ impl<T: Element> BlockTapes<T> {
         }
     }
 
-    /// Rollout k: along the policy's actions if it is the first, along the plan's otherwise.
+    /// Rollout k: the first along the policy's actions, the others along the updated ones.
     fn roll_out(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, samples: Samples<'_, T>, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
         let x = &mut x[..samples.x.len()];
@@ -242,7 +242,7 @@ impl<T: Element> BlockTapes<T> {
         rollouts[k].forward(network, (x, samples.x_g), (source, actions), purpose, buffers);
     }
 
-    /// Update k of the actions: a step down the inner loss, by its gradient in the actions.
+    /// Update k of the actions: a gradient step on the inner loss.
     fn update(&mut self, network: &PolicyDynamics<T>, settings: Settings<T>, rows: usize, k: usize) {
         let Self { rollouts, buffers, actions, x, .. } = self;
         rollouts[k].vjp(network, &mut x[..rows * network.sizes.latent], buffers);
@@ -252,7 +252,7 @@ impl<T: Element> BlockTapes<T> {
         }
     }
 
-    /// The outer loss, the mean squared error of the actions; leaves its gradient in the planned actions.
+    /// The outer loss, the mean squared error of the planned actions; writes its gradient in them to `actions_hat`.
     fn behaviour_cloning_loss(
         &mut self,
         sizes: Sizes,
@@ -275,15 +275,15 @@ impl<T: Element> BlockTapes<T> {
         loss
     }
 
-    /// The loss' decrease by α in update k, ∂/∂α.
+    /// The negative derivative of the outer loss in α of update k: Σ â ∂L/∂a, with the inner loss L.
     fn step_size_hat(&self, sizes: Sizes, rows: usize, k: usize) -> T {
         let size = self.rollouts[k].steps.len() * rows * sizes.actions;
         self.actions_hat[..size].iter().zip(&self.rollouts[k].gradient).map(|(hat, gradient)| *hat * *gradient).sum()
     }
 
-    /// The first half of the way back through update k, a ← a - α ∂L/∂a: the loss' derivative in ∂L/∂a is ȧ = -α â, and its
-    /// derivative in all that ∂L/∂a depends on is that of L's tangent along ȧ, whose passes begin here and end in
-    /// [`Self::rollout_backward`].
+    /// The first half of the backward pass of update k, a ← a - α ∂L/∂a: the gradient in ∂L/∂a is ȧ = -α â, so that the gradients
+    /// in the arguments of ∂L/∂a are those of the tangent of L along ȧ. Computes the tangent pass, and x̂ at the end of the
+    /// rollout, for [`Self::rollout_backward`].
     fn begin_update_backward(
         &mut self,
         network: &PolicyDynamics<T>,
@@ -306,14 +306,14 @@ impl<T: Element> BlockTapes<T> {
             network.jvp(rows, t == 0, step, &actions_dot[t * size..][..size], x_dot, buffers);
         }
 
-        // The Huber loss has a second derivative, 1, where it is quadratic.
+        // The second derivative of the Huber loss: 1 where it is quadratic, else 0.
         for (((x_hat, x_g_hat), x_dot), error) in x_hat.iter_mut().zip(x_g_hat).zip(x_dot).zip(goal_error) {
             *x_hat = if huber_grad(*error) == *error { *x_dot } else { T::ZERO };
             *x_g_hat -= *x_hat;
         }
     }
 
-    /// The way back along rollout k: from x̂_H to x̂_0, and to â before the update.
+    /// Backward pass of rollout k: from x̂_H to x̂_0, and to â before the update.
     fn rollout_backward(
         &mut self,
         network: &PolicyDynamics<T>,
@@ -328,7 +328,7 @@ impl<T: Element> BlockTapes<T> {
         let order = if settings.updates > 0 { Order::Second } else { Order::First };
         for (t, step) in rollouts[k].steps.iter_mut().enumerate().rev() {
             let branches = Branches {
-                // The first step's x does not move with the actions.
+                // The first step's x does not depend on the actions.
                 trunk: if t > 0 { order } else { Order::First },
                 dynamics: settings.is_state_needed(t).then_some(order),
                 policy: k == 0,

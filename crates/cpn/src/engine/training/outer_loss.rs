@@ -1,4 +1,4 @@
-//! The trainer's entry: an outer loss of a batch of frames, and its gradient in every weight.
+//! Outer loss of a batch of frames, with its gradient in all weights: encoder and outer loop combined.
 
 use super::encoder_pass::EncoderPass;
 use super::outer_loop::{OuterLoop, Samples};
@@ -15,23 +15,23 @@ use std::time::Instant;
 pub struct Gradient {
     /// The loss.
     pub loss: f64,
-    /// The gradient by the name of the weight, row by row.
+    /// The gradient by the weights' names in a checkpoint, in row-major order.
     pub weights: BTreeMap<String, Vec<f32>>,
     /// Time in the encoder, forward and backward, in seconds.
     pub encoder_seconds: f64,
 }
 
-/// Outer losses and their gradients without a graph ([`crate::engine`]).
+/// Outer losses and their gradients, without an autograd graph ([`crate::engine`]).
 #[derive(Debug)]
 pub struct OuterLoss {
-    /// Z.
+    /// Z, the size of an embedding.
     latent: usize,
     encoder_pass: EncoderPass<f32>,
     outer_loop: OuterLoop<f32>,
 }
 
 impl OuterLoss {
-    /// Outer losses of models of a valid configuration, with images embedded in this precision, on some threads.
+    /// Outer losses of models with a valid configuration, with images embedded in `precision`, on `threads` threads, at least one.
     pub fn new(config: &ModelConfig, precision: Precision, threads: usize) -> Self {
         Self {
             latent: config.encoder.latent() as usize,
@@ -40,7 +40,7 @@ impl OuterLoss {
         }
     }
 
-    /// The outer loss of a batch and its gradient, by the name of each weight that takes part; agrees with autograd's.
+    /// The outer loss of a batch and its gradient, for weights that affect the loss. It equals autograd's, within rounding errors.
     pub fn differentiate(&mut self, weights: &impl Weights<f32>, batch: &Batch) -> Gradient {
         let started = Instant::now();
         let (embeddings, embedded) = self.encoder_pass.forward(weights, batch.frames.observed());
@@ -55,7 +55,7 @@ impl OuterLoss {
         let samples = Samples { x: &x, x_g: &x_g, actions: &batch.actions, mask: &batch.mask };
         let outer = self.outer_loop.run(weights, samples);
 
-        // Each frame's gradient is the sum over the samples that it belongs to.
+        // A frame's gradient is the sum over its samples, as observation or goal.
         let mut hat = vec![0.0; embeddings.len()];
         for (rows, gradient) in [(&batch.observations, outer.x), (&batch.goals, outer.x_g)] {
             for (row, gradient) in rows.iter().zip(gradient.chunks_exact(latent)) {

@@ -1,7 +1,7 @@
-//! A block-sparse linear layer: each row reads its active inputs alone and computes its active blocks of outputs alone.
+//! Block-sparse linear layer: for each row only the active inputs are read, and only the active blocks of outputs computed.
 //!
-//! The inputs are activations after a rectified linear unit, about half of them zero. The outputs come in blocks of O; a block is
-//! inactive where its factor is zero.
+//! The inputs are activations after a rectified linear unit, about half of them zero. The outputs are divided into blocks of O; a
+//! block is inactive where the gated input is zero.
 
 use crate::engine::layers::passes::{Cotangent, Primal};
 use crate::engine::layers::relu::ActiveSet;
@@ -11,24 +11,24 @@ use crate::engine::simd::vector::{Vector, VectorShape, add, registers, registers
 use pulp::{Arch, Simd, WithSimd};
 use std::ops::Range;
 
-/// The layer's weights. O' is O rounded up to whole registers, filled up with zeros.
+/// The layer's weights. O' is O rounded up to whole registers, padded with zeros.
 #[derive(Debug)]
 pub struct BlockSparseLinear<T> {
-    /// K.
+    /// K, the number of inputs.
     pub inputs: usize,
     /// O'.
     pub width: usize,
-    /// O.
+    /// O, the number of outputs in a block.
     outputs: usize,
     /// `[blocks, K, O']`.
     weight: AlignedVec<T>,
     /// `[blocks, O']`.
     bias: AlignedVec<T>,
-    /// Zeros, `[blocks, O']`: the bias of a tangent.
+    /// Zeros, `[blocks, O']`, the bias in a jvp.
     zeros: AlignedVec<T>,
 }
 
-/// Gradient of a loss in the weights, in the same layout.
+/// Gradient of a loss in the weights, in the layout of the layer.
 #[derive(Debug)]
 pub struct BlockSparseGradient<T> {
     pub weight: AlignedVec<T>,
@@ -40,7 +40,7 @@ pub struct BlockSparseGradient<T> {
 pub struct BlockRange<'a> {
     pub rows: usize,
     pub blocks: Range<usize>,
-    /// The active ones among them for each row.
+    /// Active blocks of each row.
     pub active: &'a ActiveSet,
 }
 
@@ -75,6 +75,7 @@ impl<T: Element> BlockSparseLinear<T> {
             bias: zeros(blocks * width),
             zeros: zeros(blocks * width),
         };
+
         for (i, block) in layer.weight.chunks_exact_mut(inputs * width).enumerate() {
             let rows: Vec<_> = (0..outputs).map(|o| &weight[(o * blocks + i) * inputs..][..inputs]).collect();
             for (k, line) in block.chunks_exact_mut(width).enumerate() {
@@ -96,23 +97,23 @@ impl<T: Element> BlockSparseLinear<T> {
         self.bias.len() / self.width
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> BlockSparseGradient<T> {
         BlockSparseGradient { weight: zeros(self.weight.len()), bias: zeros(self.bias.len()) }
     }
 
-    /// y = a x + b of a range, from the `active` inputs of x `[R, K]`; y is passed to `epilogue` in registers.
+    /// y = a x + b of a range, from the `active` inputs of x `[R, K]`; `epilogue` consumes y in registers.
     pub fn forward(&self, range: &BlockRange<'_>, active: &ActiveSet, x: &[T], epilogue: &mut impl Epilogue<T>) {
         Arch::new().dispatch(Forward { layer: self, range, active, bias: &self.bias, x, epilogue });
     }
 
-    /// The tangent ẏ = a ẋ of a range, passed to `epilogue` in registers.
+    /// The tangent ẏ = a ẋ of a range; `epilogue` consumes it in registers.
     pub fn jvp(&self, range: &BlockRange<'_>, active: &ActiveSet, x_dot: &[T], epilogue: &mut impl Epilogue<T>) {
         Arch::new().dispatch(Forward { layer: self, range, active, bias: &self.zeros, x: x_dot, epilogue });
     }
 
-    /// The gradient x̄ `[R, K]` of ȳ, which comes range by range, `[R, its blocks, O']`: the first range begins anew, and the last
-    /// completes x̄. Until then `sums` has a register for each active x̄, whose lanes are summed once for all ranges.
+    /// The gradient x̄ `[R, K]` of ȳ, which is passed range by range, `[R, blocks of the range, O']`. The first range resets the
+    /// partial `sums`, a register for each active x̄; the last range adds up their lanes and writes x̄.
     pub fn vjp(
         &self,
         range: &BlockRange<'_>,
@@ -128,7 +129,7 @@ impl<T: Element> BlockSparseLinear<T> {
         }
     }
 
-    /// The gradient in the weights of a range, added: of ŷ and, in the second order, ȳ, from x and ẋ.
+    /// Adds the gradient in the weights of a range, of ŷ and, in the second order, ȳ, from x and ẋ.
     pub fn accumulate(
         &self,
         range: &BlockRange<'_>,
@@ -141,7 +142,7 @@ impl<T: Element> BlockSparseLinear<T> {
         if cotangent.is_second_order() {
             Arch::new().dispatch(WeightGradient::<T, true> { layer, range, active, primal, cotangent, gradient });
         } else {
-            // The terms of the second order are not read, but their rows are there.
+            // Placeholders: the terms of the second order are sliced, but not read.
             let primal = Primal { x_dot: primal.x, ..primal };
             let cotangent = Cotangent { y_bar: cotangent.y_hat, ..cotangent };
             Arch::new().dispatch(WeightGradient::<T, false> { layer, range, active, primal, cotangent, gradient });
@@ -163,7 +164,7 @@ impl<T: Element> BlockSparseLinear<T> {
         [weight, bias.map(|(o, i)| gradient.bias[i * width + o]).collect()]
     }
 
-    /// Registers of O'.
+    /// Number of registers of O'.
     #[inline(always)]
     fn registers<S: Simd>(&self) -> usize {
         self.width / Vector::<S, T>::COUNT
@@ -186,9 +187,9 @@ impl<T: Element> BlockSparseGradient<T> {
     }
 }
 
-/// A pass over the active blocks of each row, P of them at a time, and W of their registers.
+/// A pass over the active blocks of each row, P blocks and W of their registers at a time.
 trait Pass<S: Simd> {
-    /// The beginning of a row, before any of its blocks.
+    /// Preparation of a row, before its blocks.
     #[inline(always)]
     fn begin(&mut self, _simd: S, _r: usize) {}
 
@@ -196,10 +197,10 @@ trait Pass<S: Simd> {
     fn blocks<const P: usize, const W: usize>(&mut self, simd: S, r: usize, blocks: [usize; P], tile: usize);
 }
 
-/// All rows of a range, with as many registers at once as keep the processor busy: no sum waits for the one before.
+/// Runs a pass over all rows of a range, with several registers at a time, whose sums are independent in the processor's pipeline.
 #[inline(always)]
 fn for_each_row<S: Simd>(simd: S, pass: &mut impl Pass<S>, range: &BlockRange<'_>, registers: usize) {
-    // Loops, for the closure of a `for_each` is not always made range of the kernel.
+    // Loops, since the closure of a `for_each` is not always inlined into the kernel.
     for r in 0..range.rows {
         let active = range.active.row(range.blocks.start, r);
         pass.begin(simd, r);
@@ -219,7 +220,7 @@ fn for_each_row<S: Simd>(simd: S, pass: &mut impl Pass<S>, range: &BlockRange<'_
     }
 }
 
-/// All active blocks of a row, at a tile of W registers.
+/// Runs a pass over all active blocks of a row, at a tile of W registers.
 #[inline(always)]
 fn for_each_block<S: Simd, const W: usize>(simd: S, pass: &mut impl Pass<S>, r: usize, active: &[u32], tile: usize) {
     let (fours, rest) = active.as_chunks::<4>();
@@ -341,8 +342,8 @@ impl<S: Simd, T: Element> Pass<S> for Vjp<'_, T> {
         for ((weight, ys), block) in weights.iter_mut().zip(&mut ys).zip(blocks) {
             *weight = layer.tiles::<S, W>(simd, block);
             let [y] = registers(simd, [&y_bar[range.offset(r, block, layer.width)..]], registers_of_block);
-            for (to, y) in ys.iter_mut().zip(&y[tile * W..][..W]) {
-                [*to] = Vector::from_registers(simd, [*y]);
+            for (y_register, y) in ys.iter_mut().zip(&y[tile * W..][..W]) {
+                [*y_register] = Vector::from_registers(simd, [*y]);
             }
         }
 
@@ -351,7 +352,7 @@ impl<S: Simd, T: Element> Pass<S> for Vjp<'_, T> {
         for k in active.row(0, r) {
             let k = *k as usize;
             let [sum] = Vector::from_registers(simd, [sums[k]]);
-            // Two chains of sums, since each waits for the one before.
+            // Two independent sums, to hide the latency of additions.
             let mut halves = [sum, Vector::splat(simd, T::ZERO)];
             for (p, (ys, weight)) in ys.iter().zip(weights).enumerate() {
                 for (w, (y, a)) in ys.iter().zip(&weight[k * tiles + tile]).enumerate() {
@@ -364,7 +365,7 @@ impl<S: Simd, T: Element> Pass<S> for Vjp<'_, T> {
     }
 }
 
-/// The horizontal sums of the partial sums: x̄, zero where an input is inactive.
+/// Horizontal sums of the partial sums: x̄, zero for inactive inputs.
 #[derive(Debug)]
 struct Accumulate<'a, T> {
     inputs: usize,

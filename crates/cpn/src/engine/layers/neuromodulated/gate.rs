@@ -1,6 +1,5 @@
-//! The attenuation networks u_β and v_γ: two linear layers with a rectified linear unit between. The sigmoid at the end belongs to
-//! the [kernels of the gated weights](super::kernels), which run over the same numbers anyway; they take the gate's outputs range
-//! by range.
+//! Gate: an attenuation network u_β or v_γ, two linear layers with a rectified linear unit between them. The final sigmoid is part
+//! of the [kernels of the gated weights](super::kernels), which consume the gate's outputs in registers, range by range.
 
 use super::block_sparse::{BlockRange, BlockSparseGradient, BlockSparseLinear, Epilogue};
 use crate::engine::layers::linear::{Linear, LinearGradient, Weights};
@@ -9,7 +8,7 @@ use crate::engine::layers::relu::{ActiveSet, relu};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 
-/// Weights of a range of blocks: 32 KB in float32.
+/// Number of weights of a range of blocks: 32 KB in float32.
 const RANGE_WEIGHTS: usize = 1 << 13;
 
 /// An attenuation network up to its sigmoid: s = a₂ h + b₂, h = relu(a₁ x + b₁), in a block of O outputs for each input of the
@@ -27,14 +26,14 @@ pub struct GateGradient<T> {
     output: BlockSparseGradient<T>,
 }
 
-/// Tape of a gate: intermediates that its passes leave for each other.
+/// Tape of a gate: intermediates for later passes.
 #[derive(Debug)]
 pub struct GateTape<T> {
-    /// K.
+    /// K, the number of hidden units.
     hidden: usize,
     /// h and ḣ, `[2 R, K]`.
     h: AlignedVec<T>,
-    /// Units whose h is not zero.
+    /// Units with non-zero h.
     active: ActiveSet,
     /// ĥ and h̄, `[2 R, K]`.
     h_adjoint: AlignedVec<T>,
@@ -48,12 +47,12 @@ impl<T: Element> Gate<T> {
         Self { hidden: Linear::named(&format!("{name}.hidden"), weights), output }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> GateGradient<T> {
         GateGradient { hidden: self.hidden.gradient(), output: self.output.gradient() }
     }
 
-    /// A gradient by the names of the weights.
+    /// A gradient by the weights' names in a checkpoint.
     pub fn in_weights(&self, name: &str, gradient: &GateGradient<T>) -> Vec<(String, Vec<T>)> {
         let mut weights = gradient.hidden.in_weights(&format!("{name}.hidden"));
         let [weight, bias] = self.output.in_weights(&gradient.output);
@@ -73,12 +72,12 @@ impl<T: Element> Gate<T> {
         self.output.width
     }
 
-    /// Blocks of a range: as many as have weights that stay in the nearest cache from one row to the next.
+    /// Number of blocks in a range, so that their weights stay in the nearest cache from row to row.
     pub fn range(&self) -> usize {
         (RANGE_WEIGHTS / (self.output.inputs * self.output.width)).max(1)
     }
 
-    /// The hidden layer: h of x `[R, inputs]`, left on the tape before any [`Self::forward`].
+    /// The hidden layer: records h of x `[R, inputs]` on the tape, for [`Self::forward`].
     pub fn begin_forward(&self, rows: usize, x: &[T], tape: &mut GateTape<T>) {
         let h = &mut tape.h[..rows * tape.hidden];
         self.hidden.forward(x, h);
@@ -86,36 +85,37 @@ impl<T: Element> Gate<T> {
         tape.active.scan(h, tape.hidden, tape.hidden, tape.hidden);
     }
 
-    /// s of a range, passed to `epilogue` while it is in registers.
+    /// s of a range; `epilogue` consumes it in registers.
     pub fn forward(&self, range: &BlockRange<'_>, tape: &GateTape<T>, epilogue: &mut impl Epilogue<T>) {
         self.output.forward(range, &tape.active, &tape.h, epilogue);
     }
 
-    /// The hidden layer's tangent: ḣ of ẋ `[R, inputs]`, left on the tape before any [`Self::jvp`].
+    /// The hidden layer's tangent: records ḣ of ẋ `[R, inputs]` on the tape, for [`Self::jvp`]. The unit's mask is applied by the
+    /// active set.
     pub fn begin_jvp(&self, rows: usize, x_dot: &[T], tape: &mut GateTape<T>) {
         let h_dot = &mut tape.h[rows * tape.hidden..2 * rows * tape.hidden];
         self.hidden.jvp(x_dot, h_dot);
     }
 
-    /// ṡ of a range, passed to `epilogue` while it is in registers.
+    /// ṡ of a range; `epilogue` consumes it in registers.
     pub fn jvp(&self, range: &BlockRange<'_>, tape: &GateTape<T>, epilogue: &mut impl Epilogue<T>) {
         self.output.jvp(range, &tape.active, &tape.h[range.rows * tape.hidden..], epilogue);
     }
 
-    /// h̄, summed over the ranges, from s̄ of one; the first range begins anew.
+    /// Adds the contribution of a range's s̄ to h̄; the first range resets h̄, and the last completes it.
     pub fn vjp(&self, range: &BlockRange<'_>, s_bar: &[T], sums: &mut AlignedVec<T>, tape: &mut GateTape<T>) {
         let size = range.rows * tape.hidden;
         self.output.vjp(range, &tape.active, s_bar, sums, &mut tape.h_adjoint[size..2 * size]);
     }
 
-    /// The hidden layer's gradient in its inputs, from h̄ after every [`Self::vjp`], added to x̄.
+    /// Adds the hidden layer's gradient in its inputs, from h̄ after [`Self::vjp`] of all ranges, to x̄.
     pub fn end_vjp(&self, rows: usize, tape: &GateTape<T>, x_bar: &mut [T]) {
         let h_bar = &tape.h_adjoint[rows * tape.hidden..2 * rows * tape.hidden];
         self.hidden.add_vjp(h_bar, x_bar);
     }
 
-    /// ĥ, summed over the ranges, and the gradient of Φ in the last layer's weights, from ŝ of a range and, in the second order,
-    /// s̄; otherwise `s_bar` is empty.
+    /// Adds the contribution of a range's ŝ to ĥ, and the gradient of Φ in the last layer's weights, of ŝ and, in the second order,
+    /// s̄; in the first order `s_bar` is empty.
     pub fn double_backward(
         &self,
         range: &BlockRange<'_>,
@@ -132,8 +132,8 @@ impl<T: Element> Gate<T> {
         self.output.vjp(range, &tape.active, s_hat, sums, &mut tape.h_adjoint[..size]);
     }
 
-    /// The hidden layer's gradient of Φ, from ĥ and, in the second order, h̄ after every [`Self::double_backward`]: added to x̂ and
-    /// to the weights' gradient. `x` holds x and, in the second order, ẋ.
+    /// Adds the hidden layer's gradient of Φ to x̂ and to the weights' gradient, from ĥ after [`Self::double_backward`] of all
+    /// ranges and, in the second order, h̄. `x` holds x and, in the second order, ẋ.
     pub fn end_double_backward(
         &self,
         rows: usize,

@@ -1,8 +1,8 @@
-//! Weights that a gate attenuates for each sample: their contribution y_o = Σ_i u_oi a_oi x_i to a layer's outputs, and its
-//! passes. The formulas stand in [`layer`](super::layer).
+//! Gated weights: weights attenuated for each sample, with the passes of their contribution y_o = Σ_i u_oi a_oi x_i to a layer's
+//! outputs. The formulas are in [`layer`](super::layer).
 //!
-//! The weights of one input lie together. Where a sample's x_i is zero after a rectified linear unit, none of them matters, in no
-//! pass: x_i is zero, so is ẋ_i, and x̄_i is not needed.
+//! The weights of an input are contiguous. No pass needs them where x_i is zero after a rectified linear unit: ẋ_i is then zero
+//! too, and x̄_i is masked by the unit.
 
 use super::block_sparse::BlockRange;
 use super::gate::{Gate, GateGradient, GateTape};
@@ -19,18 +19,18 @@ use std::ops::Range;
 /// The weights and their gate.
 #[derive(Debug)]
 pub struct GatedWeights<T> {
-    /// I.
+    /// I, the number of inputs.
     pub inputs: usize,
-    /// O.
+    /// O, the number of outputs.
     pub outputs: usize,
     /// Number of leading inputs that are outputs of a rectified linear unit.
     rectified: usize,
-    /// a, `[I, O']`: filled up with zeros to whole registers.
+    /// a, `[I, O']`: rows padded with zeros to whole registers.
     a: AlignedVec<T>,
     pub gate: Gate<T>,
 }
 
-/// Gradient of a loss in the weights and in those of their gate.
+/// Gradient of a loss in the weights and in the gate's weights.
 #[derive(Debug)]
 pub struct GatedWeightsGradient<T> {
     /// `[I, O']`.
@@ -38,26 +38,26 @@ pub struct GatedWeightsGradient<T> {
     pub gate: GateGradient<T>,
 }
 
-/// Tape of the passes. A range of u stands where its blocks would in `[I, R, O']`, row by row; of ṡ likewise.
+/// Tape of the passes. u and ṡ, `[I, R, O']` in size, are stored range by range: `[R, blocks of the range, O']` for each.
 #[derive(Debug)]
 pub struct GatedWeightsTape<T> {
-    /// Inputs that are active.
+    /// Active inputs.
     active: ActiveSet,
     u: AlignedVec<T>,
     s_dot: AlignedVec<T>,
     pub gate: GateTape<T>,
 }
 
-/// Scratch memory that no pass needs beyond its end.
+/// Scratch memory of a pass, shared by the layers.
 #[derive(Debug)]
 pub struct Scratch<T> {
     /// ŝ and s̄ of a range.
     s: AlignedVec<T>,
-    /// Partial sums, over the ranges, of an adjoint of h.
+    /// Partial sums of h̄ or ĥ over the ranges.
     sums: AlignedVec<T>,
 }
 
-/// Results of [`GatedWeights::double_backward`], both added to.
+/// Results of [`GatedWeights::double_backward`], which adds to both.
 #[derive(Debug)]
 pub struct Adjoints<'a, T> {
     /// x̂, `[R, I]`.
@@ -66,7 +66,7 @@ pub struct Adjoints<'a, T> {
 }
 
 impl<T: Element> Scratch<T> {
-    /// An empty scratch memory; it grows.
+    /// An empty scratch memory, which grows on use.
     pub fn new() -> Self {
         Self { s: zeros(0), sums: zeros(0) }
     }
@@ -85,7 +85,7 @@ impl<T: Element> GatedWeights<T> {
         Self { inputs, outputs, rectified, a: transposed, gate }
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> GatedWeightsGradient<T> {
         GatedWeightsGradient { a: zeros(self.a.len()), gate: self.gate.gradient() }
     }
@@ -108,16 +108,16 @@ impl<T: Element> GatedWeights<T> {
         self.gate.width()
     }
 
-    /// The view that the kernels take.
+    /// View of the weights for the kernels.
     fn view(&self) -> WeightsView<'_, T> {
         WeightsView { inputs: self.inputs, outputs: self.outputs, width: self.width(), a: &self.a }
     }
 
-    /// The contribution of x to y, added; `seen` are the inputs of the gate.
-    pub fn forward(&self, rows: usize, seen: &[T], x: &[T], tape: &mut GatedWeightsTape<T>, y: &mut [T]) {
+    /// Adds the contribution of x to y; `gate_x` are the inputs of the gate.
+    pub fn forward(&self, rows: usize, gate_x: &[T], x: &[T], tape: &mut GatedWeightsTape<T>, y: &mut [T]) {
         let GatedWeightsTape { active, u, gate, .. } = tape;
         active.scan(x, self.inputs, self.rectified, self.gate.range());
-        self.gate.begin_forward(rows, seen, gate);
+        self.gate.begin_forward(rows, gate_x, gate);
 
         for range in self.ranges(rows, active) {
             let u = &mut u[self.span(&range)];
@@ -125,7 +125,7 @@ impl<T: Element> GatedWeights<T> {
         }
     }
 
-    /// The gradient in x of ȳ, added to x̄, but for the part that goes through the gate.
+    /// Adds the gradient in x, of ȳ, to x̄, except the part through the gate ([`Gate::end_vjp`]).
     pub fn vjp(
         &self,
         rows: usize,
@@ -144,17 +144,17 @@ impl<T: Element> GatedWeights<T> {
         }
     }
 
-    /// The contribution of x and ẋ to ẏ, added; `seen_dot` is the tangent of the gate's inputs.
+    /// Adds the contribution of x and ẋ to ẏ; `gate_x_dot` is the tangent of the gate's inputs.
     pub fn jvp(
         &self,
         rows: usize,
-        seen_dot: &[T],
+        gate_x_dot: &[T],
         Primal { x, x_dot }: Primal<'_, T>,
         tape: &mut GatedWeightsTape<T>,
         y_dot: &mut [T],
     ) {
         let GatedWeightsTape { active, u, s_dot, gate } = tape;
-        self.gate.begin_jvp(rows, seen_dot, gate);
+        self.gate.begin_jvp(rows, gate_x_dot, gate);
 
         for range in self.ranges(rows, active) {
             let span = self.span(&range);
@@ -163,7 +163,7 @@ impl<T: Element> GatedWeights<T> {
         }
     }
 
-    /// The gradient of Φ in x and in the weights, but for the part of x̂ that goes through the gate.
+    /// Adds the gradient of Φ in x and in the weights, except the part of x̂ through the gate ([`Gate::end_double_backward`]).
     pub fn double_backward(
         &self,
         rows: usize,
@@ -204,13 +204,13 @@ impl<T: Element> GatedWeights<T> {
         }
     }
 
-    /// The span of a range within u and ṡ.
+    /// Indices of a range in u and ṡ.
     fn span(&self, range: &BlockRange<'_>) -> Range<usize> {
         let size = range.rows * self.width();
         range.blocks.start * size..range.blocks.end * size
     }
 
-    /// The ranges that the passes go through.
+    /// Ranges of inputs, in the order of the passes.
     fn ranges<'a>(&self, rows: usize, active: &'a ActiveSet) -> impl Iterator<Item = BlockRange<'a>> + use<'a, T> {
         let (inputs, count) = (self.inputs, self.gate.range());
         let range = move |first: usize| BlockRange { rows, blocks: first..inputs.min(first + count), active };

@@ -1,7 +1,7 @@
-//! Kernels of the passes over gated weights. The formulas stand in [`layer`](super::layer).
+//! Kernels of the passes over gated weights. The formulas are in [`layer`](super::layer).
 //!
-//! Each kernel runs over R samples and a range of the inputs; `a` is `[inputs, O']`, arrays of u are `[R, some inputs, O']`, all
-//! others `[R, inputs]` or `[R, O]`.
+//! Each kernel runs over R samples and a range of the inputs. `a` and `in_a` are `[inputs, O']`; u and s with their tangents and
+//! gradients are `[R, inputs of the range, O']`; x is `[R, inputs]` and y `[R, O]`.
 
 use super::block_sparse::{BlockRange, Epilogue};
 use crate::engine::layers::passes::{Cotangent, Primal};
@@ -9,12 +9,12 @@ use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::{Vector, registers, registers_mut};
 use pulp::{Simd, WithSimd};
 
-/// View of the weights that a gate attenuates.
+/// View of the attenuated weights.
 #[derive(Debug, Clone, Copy)]
 pub struct WeightsView<'a, T> {
-    /// I.
+    /// I, the number of inputs.
     pub inputs: usize,
-    /// O.
+    /// O, the number of outputs.
     pub outputs: usize,
     /// O', O rounded up to whole registers.
     pub width: usize,
@@ -23,14 +23,14 @@ pub struct WeightsView<'a, T> {
 }
 
 impl<T: Element> WeightsView<'_, T> {
-    /// Registers of O'.
+    /// Number of registers of O'.
     #[inline(always)]
     fn registers<S: Simd>(&self) -> usize {
         self.width / Vector::<S, T>::COUNT
     }
 }
 
-/// The forward pass, as an epilogue of the gate: leaves u = σ(s), adds to y.
+/// Forward pass, as an epilogue of the gate: writes u = σ(s), and adds to y.
 #[derive(Debug)]
 pub struct Forward<'a, T> {
     pub weights: WeightsView<'a, T>,
@@ -68,7 +68,7 @@ impl<T: Element> Epilogue<T> for Forward<'_, T> {
     }
 }
 
-/// The vjp: adds to x̄, writes s̄.
+/// Backward pass (vjp): adds to x̄, and writes s̄.
 #[derive(Debug)]
 pub struct Vjp<'a, T> {
     pub weights: WeightsView<'a, T>,
@@ -114,7 +114,7 @@ impl<S: Simd, T: Element> OutputTiles<S> for Vjp<'_, T> {
     }
 }
 
-/// The jvp, as an epilogue of the gate: leaves ṡ, adds to ẏ.
+/// Tangent pass (jvp), as an epilogue of the gate: writes ṡ, and adds to ẏ.
 #[derive(Debug)]
 pub struct Jvp<'a, T> {
     pub weights: WeightsView<'a, T>,
@@ -156,7 +156,7 @@ impl<T: Element> Epilogue<T> for Jvp<'_, T> {
     }
 }
 
-/// The backward pass of Φ in the first order, the terms of ŷ: adds to x̂ and to the gradient in a, writes ŝ.
+/// Backward pass of Φ in the first order, with the terms of ŷ: adds to x̂ and to the gradient in a, and writes ŝ.
 #[derive(Debug)]
 pub struct FirstOrderBackward<'a, T> {
     pub weights: WeightsView<'a, T>,
@@ -205,7 +205,7 @@ impl<S: Simd, T: Element> OutputTiles<S> for FirstOrderBackward<'_, T> {
     }
 }
 
-/// The backward pass of Φ in the second order, the terms of ŷ and ȳ: adds to x̂ and to the gradient in a, writes ŝ and s̄.
+/// Backward pass of Φ in the second order, with the terms of ŷ and ȳ: adds to x̂ and to the gradient in a, and writes ŝ and s̄.
 #[derive(Debug)]
 pub struct SecondOrderBackward<'a, T> {
     pub weights: WeightsView<'a, T>,
@@ -267,13 +267,13 @@ impl<S: Simd, T: Element> OutputTiles<S> for SecondOrderBackward<'_, T> {
     }
 }
 
-/// A pass through the outputs of each row, W registers of them at a time, and through the inputs for each.
+/// A pass over the outputs of each row, W registers at a time, with an inner loop over the inputs.
 trait OutputTiles<S: Simd> {
     /// The outputs of row r from register `at` on.
     fn tile<const W: usize>(&mut self, simd: S, r: usize, at: usize);
 }
 
-/// All tiles of all rows.
+/// Runs a pass over all tiles of all rows.
 #[inline(always)]
 fn for_each_tile<S: Simd>(simd: S, pass: &mut impl OutputTiles<S>, rows: usize, registers: usize) {
     for r in 0..rows {
@@ -293,7 +293,7 @@ fn for_each_tile<S: Simd>(simd: S, pass: &mut impl OutputTiles<S>, rows: usize, 
     }
 }
 
-/// W registers of a row of O numbers, from register `at` on, with zeros behind its end.
+/// Loads W registers of a row of O elements, from register `at` on, with zeros past its end.
 #[inline(always)]
 fn load<S: Simd, T: Element, const W: usize>(simd: S, row: &[T], at: usize) -> [Vector<S, T>; W] {
     let mut values = [Vector::splat(simd, T::ZERO); W];
@@ -303,7 +303,7 @@ fn load<S: Simd, T: Element, const W: usize>(simd: S, row: &[T], at: usize) -> [
     values
 }
 
-/// Writes W registers of a row from register `at` on.
+/// Stores W registers of a row from register `at` on.
 #[inline(always)]
 fn store<S: Simd, T: Element, const W: usize>(values: [Vector<S, T>; W], row: &mut [T], at: usize) {
     for (w, values) in values.into_iter().enumerate() {

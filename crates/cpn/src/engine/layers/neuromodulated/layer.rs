@@ -1,14 +1,14 @@
-//! The neuromodulated layer y = (u ⊙ a) x + v ⊙ b, where u = σ(s), s = u_β(x), and v likewise.
+//! Neuromodulated layer y = (u ⊙ a) x + v ⊙ b, where u = σ(s), s = u_β(x), and likewise v by v_γ.
 //!
 //! With u' = u (1 - u) and u'' = u' (1 - 2 u), for one sample, output o and input i:
 //!
 //! - y_o = Σ_i u_oi a_oi x_i + v_o b_o
 //! - ẏ_o = Σ_i a_oi (u'_oi ṡ_oi x_i + u_oi ẋ_i) + v'_o ṡ_o b_o
-//! - x̄_i = Σ_o ȳ_o u_oi a_oi, and s̄_oi = ȳ_o a_oi u'_oi x_i, which goes on into the gate
+//! - x̄_i = Σ_o ȳ_o u_oi a_oi, and s̄_oi = ȳ_o a_oi u'_oi x_i, the gradient in the gate's outputs
 //! - of Φ = ŷᵀy + ȳᵀẏ, with p_oi = ŷ_o x_i + ȳ_o ẋ_i and q_oi = ȳ_o ṡ_oi x_i:
 //!   ∂Φ/∂a_oi = u_oi p_oi + u'_oi q_oi, ŝ_oi = a_oi (u'_oi p_oi + u''_oi q_oi), x̂_i = Σ_o a_oi (ŷ_o u_oi + ȳ_o u'_oi ṡ_oi)
 //!
-//! and for v the same with b in place of a and 1 in place of x: a bias is the weight of an input that is always 1.
+//! and for v the same with b for a and 1 for x: a bias is the weight of a constant input 1.
 
 use super::gated_weights::{Adjoints, GatedWeights, GatedWeightsGradient, GatedWeightsTape, Scratch};
 use crate::engine::layers::linear::Weights;
@@ -29,7 +29,7 @@ pub struct NeuromodulatedGradient<T> {
     b: GatedWeightsGradient<T>,
 }
 
-/// Tape of the layer: intermediates that its passes leave for each other.
+/// Tape of the layer: intermediates for later passes.
 #[derive(Debug)]
 pub struct NeuromodulatedTape<T> {
     a: GatedWeightsTape<T>,
@@ -38,7 +38,7 @@ pub struct NeuromodulatedTape<T> {
     ones: Vec<T>,
     /// The tangent of that input.
     zeros: Vec<T>,
-    /// A sink for its adjoints, which nothing needs.
+    /// Sink for the gradients in that input, which are not needed.
     sink: Vec<T>,
 }
 
@@ -60,12 +60,12 @@ impl<T: Element> Neuromodulated<T> {
         self.a.outputs
     }
 
-    /// A gradient of zeros.
+    /// A zero gradient.
     pub fn gradient(&self) -> NeuromodulatedGradient<T> {
         NeuromodulatedGradient { a: self.a.gradient(), b: self.b.gradient() }
     }
 
-    /// A gradient by the names of the weights.
+    /// A gradient by the weights' names in a checkpoint.
     pub fn in_weights(&self, name: &str, gradient: &NeuromodulatedGradient<T>) -> Vec<(String, Vec<T>)> {
         let mut weights = vec![
             (format!("{name}.weight"), self.a.in_a(&gradient.a)),
@@ -89,7 +89,7 @@ impl<T: Element> Neuromodulated<T> {
         self.b.forward(rows, x, &tape.ones[..rows], &mut tape.b, y);
     }
 
-    /// The gradient in x of ȳ, added to x̄.
+    /// Adds the gradient in x, of ȳ, to x̄.
     pub fn vjp(
         &self,
         rows: usize,
@@ -113,7 +113,7 @@ impl<T: Element> Neuromodulated<T> {
         self.b.jvp(rows, x_dot, Primal { x: &tape.ones, x_dot: &tape.zeros }, &mut tape.b, y_dot);
     }
 
-    /// The gradient of Φ, added to x̂ and to the weights' gradient.
+    /// Adds the gradient of Φ to x̂ and to the weights' gradient.
     pub fn double_backward(
         &self,
         rows: usize,
@@ -196,7 +196,7 @@ mod tests {
         Named(named.collect())
     }
 
-    /// x, of which the unit left the first, with zeros among them, and ẋ, zero where they are.
+    /// x, whose first inputs are outputs of a rectified linear unit, and ẋ, zero where these are zero.
     fn inputs(sizes: Sizes) -> [Vec<f64>; 2] {
         let [mut x, mut x_dot] = [numbers(ROWS * sizes.inputs, 21), numbers(ROWS * sizes.inputs, 22)];
         for i in (0..x.len()).filter(|i| i % sizes.inputs < sizes.rectified) {
@@ -206,11 +206,11 @@ mod tests {
         [x, x_dot]
     }
 
-    /// y and ẏ of one row by the layer's definition.
+    /// y and ẏ of one row, by the layer's definition.
     fn naive(Named(weights): &Named, sizes: Sizes, x: &[f64], x_dot: &[f64]) -> [Vec<f64>; 2] {
         let weight = |name: &str| &weights[&format!("layer.{name}")];
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        // Each attenuation, and its tangent.
+        // Attenuations with their tangents.
         let gate = |name: &str| {
             let [a1, b1, a2, b2] = ["hidden.weight", "hidden.bias", "output.weight", "output.bias"]
                 .map(|part| weight(&format!("{name}.{part}")));
@@ -224,8 +224,10 @@ mod tests {
             };
             a2.chunks(sizes.hidden).zip(b2).map(attenuation).collect::<Vec<_>>()
         };
+
         let (u, v) = (gate("u"), gate("v"));
         let (a, b) = (weight("weight"), weight("bias"));
+
         let mut y = vec![0.0; sizes.outputs];
         let mut y_dot = vec![0.0; sizes.outputs];
         for o in 0..sizes.outputs {
@@ -247,7 +249,7 @@ mod tests {
         [0, 1].map(|part| rows.iter().flat_map(|row| row[part].clone()).collect())
     }
 
-    /// The derivative of `f` in x at 0.
+    /// The derivative of `f` at 0, by central differences.
     fn central(f: impl Fn(f64) -> f64) -> f64 {
         (f(STEP) - f(-STEP)) / (2.0 * STEP)
     }
@@ -272,7 +274,7 @@ mod tests {
         let weights = weights(sizes);
         let layer = Neuromodulated::<f64>::named("layer", sizes.rectified, &weights);
         assert_eq!((layer.inputs(), layer.outputs()), (sizes.inputs, sizes.outputs));
-        // For more rows than there are.
+        // A tape for more rows than are used.
         let (mut tape, mut scratch) = (layer.tape(ROWS + 2), Scratch::new());
         let [x, x_dot] = inputs(sizes);
         let stacked_x = [&x[..], &x_dot].concat();
@@ -286,7 +288,7 @@ mod tests {
         layer.forward(ROWS, &x, &mut tape, &mut y);
         y.iter().zip(&expected_y).for_each(|(ours, expected)| assert_close(*ours, *expected, "forward"));
 
-        // Gradients in an input that is not active are not needed.
+        // Gradients in inactive inputs are undefined.
         let needed: Vec<_> = (0..x.len()).filter(|i| i % sizes.inputs >= sizes.rectified || x[*i] > 0.0).collect();
         let mut x_bar = vec![0.5; x.len()];
         layer.vjp(ROWS, &x, &y_bar, &mut tape, &mut scratch, &mut x_bar);
@@ -324,7 +326,7 @@ mod tests {
             for (name, ours) in ours {
                 let values = &weights.0[&name];
                 assert_eq!(ours.len(), values.len(), "{name}");
-                // Some of many.
+                // A sample of the weights.
                 for i in (0..values.len()).step_by(values.len().div_ceil(40)) {
                     let f = |by| {
                         let mut others = Named(weights.0.clone());
@@ -346,7 +348,7 @@ mod tests {
         }
     }
 
-    /// Weights of a gate that do not fit a range.
+    /// A gate whose weights exceed one range.
     #[test]
     fn passes_in_several_ranges_are_finite_differences() {
         let sizes = Sizes { inputs: 7, outputs: 33, hidden: 70, rectified: 5 };

@@ -1,4 +1,4 @@
-//! The neuromodulated layer: [weights that a gate attenuates](gated_weights) for each sample, put together in [`layer`].
+//! Neuromodulated layer: [gated weights](gated_weights), with their gates and kernels, combined in [`layer`].
 
 pub mod block_sparse;
 pub mod gate;
