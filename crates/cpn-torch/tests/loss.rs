@@ -1,7 +1,5 @@
 //! Outer loss and gradient of the native engine, in its training precisions, against autograd.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use cpn::archive::Tensor as Archived;
 use cpn::engine::OuterLoss;
 use cpn::{Batch, Frames, MethodKind, Model, ModelConfig, Precision};

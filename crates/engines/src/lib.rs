@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn an_unavailable_engine_or_device_is_named() {
-        let error = |engine, device| build(engine, device, 1).map(drop).unwrap_err().to_string();
+        let error = |engine, device| build(engine, device, 1).map(drop).expect_err("no such engine").to_string();
         let native = error(Some(EngineKind::Native), Device::Cuda(0));
         assert_eq!(native, "device: expected cpu for the engine native, got cuda:0");
         let torch = error(None, Device::Cuda(99));

@@ -189,14 +189,14 @@ mod tests {
         let half: Vec<bool> = (0..n).map(|at| at < n / 2).collect();
         let none = vec![false; n];
         let task = TaskOutcomes { a: arm(0, &[&half]), b: arm(0, &[&none]) };
-        let (low, high) = bootstrap(&[task.clone()]);
+        let (low, high) = bootstrap(std::slice::from_ref(&task));
         let error = normal_quantile() * (0.25 / n as f64).sqrt();
         assert!((low - 0.5 + error).abs() < 0.006 && (high - 0.5 - error).abs() < 0.006, "{low}, {high}");
         // Two strata: half the variance.
         let (low, high) = bootstrap(&[task.clone(), task.clone()]);
         let error = error / 2f64.sqrt();
         assert!((low - 0.5 + error).abs() < 0.006 && (high - 0.5 - error).abs() < 0.006, "{low}, {high}");
-        assert_eq!(bootstrap(&[task.clone()]), bootstrap(&[task]));
+        assert_eq!(bootstrap(std::slice::from_ref(&task)), bootstrap(std::slice::from_ref(&task)));
     }
 
     /// Of two training runs of which one solves everything and one nothing, the interval is everything that may be: variations

@@ -75,7 +75,7 @@ fn compare(a: &[Source], b: &[Source]) -> Comparison {
 }
 
 fn refusal(a: &Source, b: &Source) -> String {
-    format!("{:#}", evaluator::compare(&[a.clone()], &[b.clone()]).unwrap_err())
+    format!("{:#}", evaluator::compare(std::slice::from_ref(a), std::slice::from_ref(b)).unwrap_err())
 }
 
 /// Nine seeds of reach are solved by cpn only, one by bc only, and three by both; of door-lock none by anyone.
@@ -177,7 +177,7 @@ fn what_was_not_evaluated_alike_is_refused_by_name() {
 
     // Another search is what may be compared.
     let updates = folder("updates", &planned(Planning { updates: Some(20), ..default }));
-    assert_eq!(compare(&[expected.clone()], &[updates]).difference, 0.0);
+    assert_eq!(compare(std::slice::from_ref(&expected), &[updates]).difference, 0.0);
 
     let cases = [
         ("goal", Run { goal: GoalSource::OtherVariation, ..base.clone() }, "goals (--goal): expected the same, got "),

@@ -141,7 +141,7 @@ async fn main() {
 /// Plans by the library in batches, without a service: the upper bound of the throughput.
 fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     let bytes = std::fs::read(models.join(format!("{MODEL}.safetensors"))).unwrap();
-    let mut planner = cpn::Planner::new(checkpoint::from_bytes(&bytes).unwrap().agent, Precision::Float32, 1);
+    let mut planner = cpn::Planner::new(&checkpoint::from_bytes(&bytes).unwrap().model, Precision::Float32, 1);
     let (goal, frames): (Image, Vec<Image>) = (image(0), (1..=batch as u8).map(image).collect());
     let x_g = planner.encode(&[Observed::Image(goal.data())]).remove(0);
     let updates = planner.updates().unwrap();

@@ -152,7 +152,7 @@ fn train(path: &Path, args: &Args) {
         // As in a run, the next batch is prepared during a step.
         scope.spawn(move || {
             let over_and_over = std::iter::repeat_with(|| sampler.batches(0).take(BATCHES)).flatten();
-            let _ = { over_and_over }.try_for_each(|batch| sender.send(batch));
+            let _ = { over_and_over }.try_for_each(|batch| sender.send(batch).ok());
         });
 
         // The first loss in float32, for comparison with the other contenders; then the warm-up.

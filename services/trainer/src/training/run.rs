@@ -89,7 +89,7 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
         scope.spawn(move || {
             let mut batches = sampler.batches(start).take((total - start) as usize);
             // Sending fails once the run is interrupted.
-            let _ = batches.try_for_each(|batch| sender.send(batch));
+            let _ = batches.try_for_each(|batch| sender.send(batch).ok());
         });
 
         for (step, batch) in (start..total).zip(batches) {
