@@ -148,7 +148,7 @@ test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and 
 test-experiment: build $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
 	cd experiments/leave_one_out && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-fuzz: system .libtorch/build-version ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
+fuzz: system ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
 	scripts/fuzz.sh
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Feeds each decoder what a stranger may send, for MINUTES each. An input that breaks one is kept in fuzz/artifacts.
+# Fuzzes each decoder for FUZZ_SECONDS, 600 by default. An input that breaks one is kept in fuzz/artifacts.
 set -euo pipefail
 cd "$(dirname "$0")/../fuzz"
 
