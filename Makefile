@@ -145,8 +145,9 @@ test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, with
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
 	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-test-experiment: build $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
-	cd experiments/leave_one_out && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+test-experiment: setup $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
+	cargo test --workspace --locked --no-run
+	cd experiments/leave_one_out && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
 
 fuzz: system ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
 	scripts/fuzz.sh
@@ -177,6 +178,7 @@ lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
 	cd fuzz && cargo fmt --check
 	cargo clippy --workspace --all-targets --locked -- -D warnings
+	cargo clippy --package planner --package trainer --no-default-features --locked -- -D warnings
 	cd sim-worker && $(UV) run --quiet ruff check $(PYTHON) && $(UV) run --quiet ruff format --check $(PYTHON) && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 

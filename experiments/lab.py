@@ -15,7 +15,8 @@ from typing import Self, TypeVar
 T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[1]
-PROGRAMS = ROOT / "target/release"
+PROGRAMS = Path(os.environ.get("CPN_PROGRAMS", ROOT / "target/release"))
+"""Folder of the services' programs; tests use those that were compiled for tests."""
 WORKER = Path(sys.executable).parent / "cpn-sim-worker"
 STOP_SECONDS = 45.0
 """Longest time from SIGTERM to the end of a service: a trainer saves its runs."""
