@@ -13,7 +13,7 @@ use wire::replay::PlannedEpisode;
 use wire::sim::{ResetResponse, Variation};
 use wire::{Code, Error, Image, Observation, Position, key};
 
-/// What chooses the actions of an episode.
+/// Source of an episode's actions: a planner or a control.
 pub(crate) enum Actor<'a> {
     Control(Control),
     Planned(Box<Planned<'a>>),
@@ -27,7 +27,7 @@ pub(crate) struct Decided {
 }
 
 impl<'a> Actor<'a> {
-    /// What acts for a model in an episode that begins; a planner gets to know the goal.
+    /// The actor of a model in a new episode; registers the goal with a planner.
     pub(crate) async fn new(
         link: &'a Link,
         planner: Service,
@@ -60,7 +60,7 @@ impl<'a> Actor<'a> {
         }
     }
 
-    /// What the planner was asked, and [`record::Episode::plan_steps`].
+    /// Recorded plan requests with their answers, and [`record::Episode::plan_steps`].
     ///
     /// # Errors
     /// If the answers do not fit together.
@@ -84,7 +84,7 @@ pub(crate) struct Planned<'a> {
     seed: u64,
     start: Instant,
     goal: Goal,
-    /// Where the next search begins; at the policy's actions if empty.
+    /// Initial actions of the next search; the policy's if empty.
     warm_start: Vec<Vec<f32>>,
     exchanges: Vec<Exchange>,
     /// Steps before each of them.
@@ -132,7 +132,7 @@ impl Planned<'_> {
     }
 }
 
-/// What an episode's goal is.
+/// Goal of an episode.
 pub(crate) fn goal(reset: &ResetResponse) -> Observation {
     reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from)
 }
@@ -152,7 +152,7 @@ pub(crate) fn plan_seed(variation: u64, step: u32) -> u64 {
     (variation << 16) + u64::from(step)
 }
 
-/// What a model is shown: where the goal is a position, that of the hand, else the picture.
+/// Observation for a model: the hand's position if the goal is a position, else the image.
 pub(crate) fn observed(reset: &ResetResponse, frame: &Image, hand: Position) -> Observation {
     if reset.goal_position.is_some() { hand.into() } else { frame.clone().into() }
 }

@@ -1,4 +1,4 @@
-//! Where things lie in the report's drawings, in SVG user units.
+//! Layout of the report's drawings, in SVG user units.
 
 use crate::filmstrip::FRAMES;
 use crate::summary::{Row, Summary};
@@ -50,7 +50,7 @@ struct Group {
 struct Bar {
     /// Index of the model.
     model: usize,
-    /// What the bar says when pointed at.
+    /// Tooltip of the bar.
     title: String,
     label: String,
     y: f64,
@@ -60,7 +60,7 @@ struct Bar {
     width: f64,
     /// Ends of the interval.
     whisker: Option<(f64, f64)>,
-    /// Where the label starts.
+    /// Start of the label.
     label_x: f64,
 }
 

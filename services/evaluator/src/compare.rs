@@ -53,7 +53,7 @@ impl fmt::Display for Source {
     }
 }
 
-/// How two arms compare on the same variations. Differences are of success rates, A - B.
+/// Comparison of two arms on the same variations. Differences are of success rates, A - B.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
     /// Records of A, one for each training run.
@@ -62,7 +62,7 @@ pub struct Comparison {
     pub b: Vec<Source>,
     /// Confidence of the intervals.
     pub confidence: f64,
-    /// How the interval of the mean over the tasks was computed.
+    /// Method of the interval of the mean over the tasks.
     pub interval_method: &'static str,
     /// SHA-256 of the seeds, in hex, as in a summary.
     pub seeds_digest: String,
@@ -103,7 +103,7 @@ pub struct TaskComparison {
     pub difference: f64,
     /// Its interval.
     pub interval: (f64, f64),
-    /// How that was computed.
+    /// Method of that interval.
     pub interval_method: &'static str,
     /// Whether the interval leaves out zero and p, if there is one, is below 1 - confidence: asymptotic intervals of few pairs alone
     /// promise too much.
@@ -118,7 +118,7 @@ struct Arm {
     records: Vec<Records>,
 }
 
-/// What one folder holds of the model.
+/// Trials of the model in one folder.
 #[derive(Debug)]
 struct Records {
     source: Source,

@@ -108,7 +108,7 @@ pub async fn run(args: &RunArgs) -> anyhow::Result<Summary> {
     schedule.drive(patience).await?;
     // A session that closes is no outage to be warned of.
     drop(connection);
-    // What is reported is in the folder by now.
+    // The report reads the records in the folder.
     if let Err(error) = session.close().await {
         tracing::warn!("closing the zenoh session: {error}");
     }
@@ -232,7 +232,7 @@ fn listed(served: &[ModelInfo]) -> String {
     served.iter().map(|model| model.name.as_str()).collect::<Vec<_>>().join(", ")
 }
 
-/// What was typed, fit to be typed again.
+/// The command line, quoted for a shell.
 fn command_line() -> String {
     let quoted = |argument: String| {
         let plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,@+".contains(c);

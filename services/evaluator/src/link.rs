@@ -34,7 +34,7 @@ impl Link {
     /// A service's answer, however often it must be asked for.
     ///
     /// # Errors
-    /// What the service answered; the last outage if it lasts; [`Code::Unavailable`] once the service is gone for good.
+    /// The service's answer; the last error if an outage lasts; [`Code::Unavailable`] once the service is gone for good.
     pub(crate) async fn call<Q: Message + Clone, R: Message>(
         &self,
         service: &Service,
@@ -69,7 +69,7 @@ pub(crate) async fn join(config: &SessionConfig, patience: Duration) -> anyhow::
 /// Asks, and asks again until so long after the first outage.
 ///
 /// # Errors
-/// What the service answered, or the last outage.
+/// The service's answer, or the error of the last outage.
 pub(crate) async fn ask<Q: Message + Clone, R: Message>(
     session: &Session,
     key: &OwnedKeyExpr,

@@ -1,4 +1,4 @@
-//! Who is alive, by liveliness tokens.
+//! Live planners and workers, by liveliness tokens.
 
 use anyhow::{anyhow, bail};
 use std::collections::BTreeSet;
@@ -41,7 +41,7 @@ impl fmt::Display for Service {
 /// The planners and the workers that are alive.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Alive {
-    /// Those of the run's planners that are.
+    /// Live planners of the run.
     pub(crate) planners: BTreeSet<String>,
     /// The workers that are.
     pub(crate) workers: BTreeSet<String>,

@@ -1,4 +1,4 @@
-//! How far an evaluation is: a bar in a terminal, a line now and then elsewhere.
+//! Progress of an evaluation: a bar in a terminal, a line at intervals elsewhere.
 
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -10,7 +10,7 @@ pub(crate) struct Progress {
     models: Vec<Count>,
 }
 
-/// What a model has reached in this invocation.
+/// Trials and successes of a model in this invocation.
 #[derive(Debug)]
 struct Count {
     model: String,

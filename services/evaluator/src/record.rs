@@ -1,4 +1,4 @@
-//! What a run leaves in its folder: one file that describes it, and one for each trial.
+//! Records of a run in its folder: one file that describes it, and one for each trial.
 
 use crate::control::Control;
 use crate::planning::Planning;
@@ -18,7 +18,7 @@ pub const FORMAT: u32 = 2;
 /// Seeds below this one are those of demonstrations.
 pub(crate) const FIRST_EVALUATION_SEED: u64 = 1_000_000;
 
-/// What was compared, and how.
+/// Description of a run: its models, tasks and settings.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Run {
     /// [`FORMAT`].
@@ -40,9 +40,9 @@ pub struct Run {
     pub trials: u32,
     /// Seed of the first variation.
     pub first_seed: u64,
-    /// Where the goals come from.
+    /// Source of the goals.
     pub goal: GoalSource,
-    /// How plans are searched for and carried out.
+    /// Settings of plans in closed loop.
     #[serde(default, skip_serializing_if = "Planning::is_default")]
     pub planning: Planning,
 }
@@ -125,19 +125,19 @@ pub struct Trial {
     pub model: String,
     /// SHA-256 of its checkpoint, in hex.
     pub model_digest: String,
-    /// Where the goal came from.
+    /// Source of the goal.
     pub goal: GoalSource,
-    /// How plans were searched for and carried out.
+    /// Settings of plans in closed loop.
     #[serde(default, skip_serializing_if = "Planning::is_default")]
     pub planning: Planning,
-    /// How it ended.
+    /// Outcome.
     #[serde(flatten)]
     pub outcome: Outcome,
-    /// What happened until then; none if there was no attempt, and after an error.
+    /// The episode; none if there was no attempt, and after an error.
     pub episode: Option<Episode>,
 }
 
-/// How a trial ended.
+/// Outcome of a trial.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "outcome", rename_all = "lowercase")]
 pub enum Outcome {
@@ -150,7 +150,7 @@ pub enum Outcome {
     SolvedAtReset,
     /// The trial was not brought to an end, which says nothing about the model.
     Error {
-        /// What went wrong.
+        /// Message of the error.
         message: String,
     },
 }
@@ -175,11 +175,11 @@ pub struct Episode {
     pub first_inner_losses: Vec<Option<f32>>,
     /// The same of the last plan.
     pub last_inner_losses: Vec<Option<f32>>,
-    /// Where the planner's time went.
+    /// Stage times of the planner.
     pub mean_times: StageTimes,
 }
 
-/// Where the planner's time went, mean over the plans of an episode.
+/// Stage times of the planner, mean over the plans of an episode.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct StageTimes {
     /// Waiting for the model.
@@ -215,7 +215,7 @@ impl Folder {
         Self { root: root.into() }
     }
 
-    /// Where a file or folder of the run lies.
+    /// Path of a file or folder of the run.
     pub fn path(&self, name: &str) -> PathBuf {
         self.root.join(name)
     }

@@ -10,14 +10,14 @@ use tokio::time::Instant;
 use wire::planner::{Goal, PlanRequest, PlanResponse, Search};
 use wire::{Observation, key};
 
-/// How long to wait for the planner.
+/// Timeout of the wait for the planner.
 const WAIT: Duration = Duration::from_secs(10);
-/// How long a router or the planner may be away.
+/// Maximum outage of a router or the planner.
 const RECOVERY: Duration = Duration::from_secs(30);
 /// Longer than any plan takes, on a slow machine too.
 const PATIENCE: Duration = Duration::from_secs(600);
 
-/// What became of a recorded episode.
+/// Result of the replay of a recorded episode.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replay {
     /// Number of recorded plans.
@@ -33,9 +33,9 @@ pub struct Difference {
     pub step: usize,
     /// Which value, for example `actions[1][0]`.
     pub value: String,
-    /// What was recorded.
+    /// Recorded value.
     pub recorded: String,
-    /// What the planner answers now.
+    /// Value of the planner's answer now.
     pub now: String,
 }
 
@@ -128,7 +128,7 @@ fn compare(step: usize, Exchange { request, response, .. }: &Exchange, mut now: 
     None
 }
 
-/// What must be the same. The actions come last, so that the others have their place however many these are.
+/// Values that must be equal. The actions come last, so that the places of the others do not depend on their number.
 fn values(plan: &PlanResponse) -> Vec<(String, &[f32])> {
     let mut values = vec![
         ("first_action".to_owned(), &plan.first_action[..]),

@@ -20,13 +20,13 @@ const COLOURS: usize = 6;
 /// The same of controls.
 const GREYS: usize = 3;
 
-/// What the template is given.
+/// Input of the template.
 #[derive(Debug, Serialize)]
 struct Page<'a> {
     run: &'a Run,
     confidence: String,
     interval_method: &'a str,
-    /// How plans were searched for and carried out.
+    /// Settings of plans in closed loop.
     planning: String,
     solved_at_reset: usize,
     errors: usize,

@@ -35,7 +35,7 @@ pub(crate) struct Schedule {
     progress: Progress,
 }
 
-/// What became of a trial.
+/// Result of a trial's attempt.
 #[derive(Debug)]
 struct Finished {
     services: Services,

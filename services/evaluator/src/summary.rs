@@ -9,12 +9,12 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Confidence of the intervals.
 pub(crate) const CONFIDENCE: f64 = 0.95;
 
-/// What a run has shown.
+/// Results of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
-    /// What was compared, and how.
+    /// Description of the run.
     pub run: Run,
-    /// How the intervals were computed.
+    /// Method of the intervals.
     pub interval_method: &'static str,
     /// Their confidence.
     pub confidence: f64,
@@ -45,7 +45,7 @@ pub struct Row {
     pub solved_at_reset: usize,
     /// Trials that were not brought to an end.
     pub errors: usize,
-    /// What went wrong first, if anything did.
+    /// Message of the first error, if any.
     pub first_error: Option<String>,
     /// Share of the trials that succeeded.
     pub rate: Option<f64>,
@@ -72,7 +72,7 @@ pub enum Training {
 }
 
 impl Training {
-    /// What tables say.
+    /// Label in tables.
     pub fn label(self) -> &'static str {
         match self {
             Self::Trained => "trained",

@@ -28,11 +28,11 @@ pub(crate) struct Services {
 pub(crate) struct Attempt {
     pub(crate) outcome: Outcome,
     pub(crate) episode: record::Episode,
-    /// What the finished task looks like.
+    /// Image of the finished task.
     pub(crate) goal: Image,
     /// Every frame from the first on, one more than steps.
     pub(crate) frames: Vec<Image>,
-    /// What the planner was asked, and its answers; none of a control.
+    /// Plan requests with their answers; none of a control.
     pub(crate) plans: Option<Plans>,
 }
 
@@ -194,7 +194,7 @@ impl Link {
     }
 }
 
-/// What the plans of an episode, if there are any, tell about themselves.
+/// Statistics of an episode's plans, if there are any.
 fn course(reset: &ResetResponse, plans: Option<&Plans>) -> record::Episode {
     let plans: Vec<_> = plans.iter().flat_map(|plans| plans.exchanges()).map(|exchange| &exchange.response).collect();
     let finite = |value: f32| value.is_finite().then_some(value);
