@@ -8,7 +8,8 @@ use cpn::search::block::{Actions, PlanBlock, Purpose};
 use cpn::{Input, Method, Model, ModelConfig};
 use tch::{Device, Kind, Tensor};
 
-/// R on the processor. Smaller batches are padded, so that a plan does not depend on the rest of the batch.
+/// R on the processor. Smaller batches are padded: at the paper's sizes a plan then does not depend on the rest of the batch, at others
+/// within rounding.
 const CPU_ROWS: usize = 16;
 /// R on a CUDA device, where the time hardly grows with the rows.
 const CUDA_ROWS: usize = 256;

@@ -32,7 +32,8 @@ pub trait Method: Send {
     /// does not depend on the rest of the batch.
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>>;
 
-    /// A plan for each query, all by the same search. A plan is bit for bit independent of the rest of the batch.
+    /// A plan for each query, all by the same search. A plan does not depend on the rest of the batch: in
+    /// any bit natively, within rounding by libtorch.
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;
 
     /// Maximum batch size of [`Method::resume`] for [`Solver::Gradient`]; for the other solvers it is one.

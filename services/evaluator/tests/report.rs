@@ -149,7 +149,7 @@ fn records_without_settings_and_progress_are_read() {
     let row = &evaluator::report(root.path()).unwrap().rows[0];
     assert_eq!((row.trials, row.mean_best_progress, row.mean_final_progress), (4, Some(0.5), Some(0.25)));
 
-    // Those of other plans are of another run.
+    // Trials with other settings of plans belong to another run.
     let planning = Planning { updates: Some(20), ..Planning::default() };
     let other = trial("door-lock", &run().models[0], 10, Outcome::Success, 40);
     folder.write_trial(&Trial { planning, ..other }).unwrap();
