@@ -13,13 +13,15 @@ STACK := tests/stack/.venv
 EXPERIMENT := experiments/leave_one_out/.venv
 # Sources of cpn-messages, a dependency of several environments.
 MESSAGES := messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
+# Folders of the experiment's committed results, one a profile.
+REPORTED := $(sort $(dir $(patsubst %/,%,$(dir $(wildcard docs/results/leave_one_out/*/*/*-*.json)))))
 COMPOSE ?= docker-compose
 # All code in Python, as seen from sim-worker, whose settings hold for it.
 PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tests/kubernetes tests/openpi tests/stack)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench test-experiment fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -85,7 +87,8 @@ experiment: build $(EXPERIMENT)/.ready ## Leave each task out, train, evaluate, 
 		--executor $(or $(EXECUTOR),local) --jobs $(or $(JOBS),$(shell nproc))
 
 experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the experiment again, from the committed results
-	for results in docs/results/leave_one_out/*/; do \
+	@test -n "$(REPORTED)" || echo "docs/results/leave_one_out: no results yet, no report"
+	for results in $(REPORTED); do \
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/aggregate.py $$results && \
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
 	done
@@ -148,6 +151,9 @@ test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and 
 test-experiment: setup $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
 	cargo test --workspace --locked --no-run
 	cd experiments/leave_one_out && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
+
+test-shipped: build ## Evaluate the shipped checkpoints, and hold README's table to every count
+	$(WORKER)/bin/python experiments/shipped.py
 
 fuzz: system ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
 	scripts/fuzz.sh

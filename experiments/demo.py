@@ -1,23 +1,15 @@
 """The closed loop on this machine: a planner and two simulators, and each method on each of three tasks."""
 
-import shutil
+from lab import ROOT, evaluate_shipped, main
 
-from lab import ROOT, Lab, main
-
+MODELS = ("cpn", "te-bc", "random")
 # Two tasks that no model has seen, one that it was trained on; see docs/decisions/0004-demonstration-tasks.md.
-TASKS = "door-lock,drawer-close,plate-slide"
+TASKS = ("door-lock", "drawer-close", "plate-slide")
 
 
 def demo() -> None:
     """Evaluates the shipped checkpoints, and leaves the report in runs/demo."""
-    out = ROOT / "runs/demo"
-    shutil.rmtree(out, ignore_errors=True)
-    with Lab(out) as lab:
-        lab.planner(ROOT / "models")
-        for worker in ("w0", "w1"):
-            lab.worker(worker)
-        options = ["--workers", "2", "--models", "cpn,te-bc,random", "--tasks", TASKS, "--trials", "20"]
-        lab.evaluate(*options, "--out", str(out))
+    evaluate_shipped(ROOT / "runs/demo", MODELS, TASKS, trials=20)
 
 
 if __name__ == "__main__":

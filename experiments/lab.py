@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -137,6 +138,21 @@ def train(lab: Lab, out: Path, *options: str) -> None:
     """
     command = [str(PROGRAMS / "cpn-trainer"), "train", "--threads", "1", "--out", str(out), *options]
     lab.run(command, log=lab.out / f"train-{out.stem}.log")
+
+
+def evaluate_shipped(out: Path, models: Iterable[str], tasks: Iterable[str], trials: int) -> None:
+    """Evaluates shipped checkpoints and controls in closed loop, with a planner and two simulators, in a folder anew.
+
+    Raises:
+        LabError: If that fails.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    with Lab(out) as lab:
+        lab.planner(ROOT / "models")
+        for worker in ("w0", "w1"):
+            lab.worker(worker)
+        options = ["--models", ",".join(models), "--tasks", ",".join(tasks), "--trials", str(trials)]
+        lab.evaluate("--workers", "2", *options, "--out", str(out))
 
 
 def on_every_core(work: Callable[[T], None], items: Iterable[T]) -> None:

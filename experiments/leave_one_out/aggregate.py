@@ -8,7 +8,6 @@ training seeds and the variations are drawn anew.
 import hashlib
 import json
 import sys
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -18,70 +17,19 @@ import yaml
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-Cell = dict[str, Any]  # A result, as jobs.py wrote it.
+from cells import ROOT
+from results import HERE, Cell, Results
 
-RECIPES = Path(__file__).with_name("methods.yaml")
+sys.path.append(str(ROOT / "sim-worker/src"))
+from cpn_sim_worker.tasks import TASKS
+
+Row = dict[str, Any]  # JSON, of summary.json.
+
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 
 
-class ResultsError(ValueError):
-    """Results that do not belong together."""
-
-
-@dataclass(frozen=True)
-class Results:
-    """Results of an experiment, complete or not."""
-
-    cells: dict[tuple[str, str], list[Cell]]
-    """Of each task and method, in the order of their training seeds."""
-    variations: dict[str, list[int]]
-    """Seeds of the variations of each task, the same for all methods."""
-    solved_at_reset: dict[str, list[int]]
-    """Seeds of those that were refused as trials: the task was solved before any action."""
-
-    @classmethod
-    def read(cls, folder: Path) -> "Results":
-        """Reads a folder of results.
-
-        Raises:
-            ResultsError: If there are none, or those of a task are of different variations.
-        """
-        cells: dict[tuple[str, str], list[Cell]] = {}
-        variations: dict[str, list[int]] = {}
-        solved_at_reset: dict[str, list[int]] = {}
-        for path in sorted(folder.glob("*/*-*.json")):
-            cell = json.loads(path.read_text()) | {"seed": int(path.stem.rpartition("-")[2])}
-            expected = variations.setdefault(path.parent.name, cell["seeds"])
-            if cell["seeds"] != expected:
-                raise ResultsError(f"{path}: expected the variations {expected}, got {cell['seeds']}")
-            solved_at_reset[path.parent.name] = cell["solved_at_reset"]
-            cells.setdefault((path.parent.name, cell["cell"]["method"]), []).append(cell)
-        if not cells:
-            raise ResultsError(f"{folder}: expected results of at least one cell, got none")
-        return cls(cells, variations, solved_at_reset)
-
-    @property
-    def tasks(self) -> list[str]:
-        """Tasks with a result."""
-        return sorted(self.variations)
-
-    @property
-    def methods(self) -> list[str]:
-        """Methods with a result, in the order of methods.yaml."""
-        found = {method for _, method in self.cells}
-        return [method for method in yaml.safe_load(RECIPES.read_text())["recipes"] if method in found]
-
-    def outcomes(self, task: str, method: str) -> NDArray[np.float64]:
-        """[training seeds, variations]: 1 for a success."""
-        return np.array([cell["successes"] for cell in self.cells[task, method]], np.float64)
-
-    def common(self, *methods: str) -> list[str]:
-        """Tasks with results of all these methods."""
-        return [task for task in self.tasks if all((task, method) in self.cells for method in methods)]
-
-
-def rate(results: Results, task: str, method: str) -> Cell:
+def rate(results: Results, task: str, method: str) -> Row:
     """Success rate of a method at a task."""
     cells = results.cells[task, method]
     outcomes = results.outcomes(task, method)
@@ -99,7 +47,7 @@ def rate(results: Results, task: str, method: str) -> Cell:
     }
 
 
-def mean(results: Results, method: str, tasks: list[str]) -> Cell:
+def mean(results: Results, method: str, tasks: list[str]) -> Row:
     """Mean success rate of a method over tasks."""
     outcomes = [results.outcomes(task, method) for task in tasks]
     draws = _bootstrap([(values,) for values in outcomes])[0]
@@ -112,7 +60,7 @@ def mean(results: Results, method: str, tasks: list[str]) -> Cell:
     }
 
 
-def compare(results: Results, a: str, b: str) -> Cell:
+def compare(results: Results, a: str, b: str) -> Row:
     """Two methods on the same variations; McNemar's test pairs trials of the same training seed."""
     tasks = results.common(a, b)
     only_a = only_b = pairs = 0
@@ -168,7 +116,7 @@ def _rounded(*values: float) -> list[float]:
     return [round(float(value), 4) for value in values]
 
 
-def cost(results: Results, task: str, method: str) -> list[Cell]:
+def cost(results: Results, task: str, method: str) -> list[Row]:
     """Cost and origin of the cells of a task and method."""
     return [
         {
@@ -176,6 +124,8 @@ def cost(results: Results, task: str, method: str) -> list[Cell]:
             "method": method,
             "seed": cell["seed"],
             "train_seconds": cell["trained"] and cell["trained"]["seconds"],
+            "samples": cell["trained"] and cell["trained"]["samples"],
+            "loss": cell["trained"] and cell["trained"]["loss"],
             "encode_ms": cell["encode_ms"],
             "plan_ms": cell["plan_ms"],
             "processor": cell["processor"],
@@ -185,8 +135,36 @@ def cost(results: Results, task: str, method: str) -> list[Cell]:
             "training_code": cell["trained"] and cell["trained"]["cell"]["code"],
             "evaluation_code": cell["cell"]["code"],
         }
-        for cell in results.cells[task, method]
+        for cell in results.cells.get((task, method), [])
     ]
+
+
+def updates(results: Results, method: str) -> list[Row]:
+    """Mean success rate and time of a plan by the number of updates U, over the tasks with results of each U."""
+    names = results.updates(method)
+    tasks = results.common(*names.values())
+    if len(names) < 2 or not tasks:
+        return []
+    rows = []
+    for number, name in names.items():
+        cells = [cell for task in tasks for cell in results.cells[task, name]]
+        plan_ms = round(float(np.mean([cell["plan_ms"] for cell in cells])), 3)
+        rows.append(mean(results, name, tasks) | {"method": method, "updates": number, "plan_ms": plan_ms})
+    return rows
+
+
+def latent_distance(cells: list[Cell]) -> dict[str, list[list[float]]]:
+    """Mean latent distance to the goal of successes and of failures: [step, mean, episodes that last so long]."""
+    pooled = {}
+    for outcome in ("success", "failure"):
+        by_step: dict[int, list[tuple[float, int]]] = {}
+        for step, value, episodes in (point for cell in cells for point in cell["latent_distance"][outcome]):
+            by_step.setdefault(step, []).append((value, episodes))
+        pooled[outcome] = [
+            [step, round(sum(value * n for value, n in found) / (total := sum(n for _, n in found)), 4), total]
+            for step, found in sorted(by_step.items())
+        ]
+    return pooled
 
 
 def variations_digest(results: Results) -> str:
@@ -195,29 +173,40 @@ def variations_digest(results: Results) -> str:
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def summarise(results: Results) -> Cell:
-    """All statistics, in JSON."""
-    methods, cells = results.methods, [(task, method) for task in results.tasks for method in results.methods]
-    cells = [key for key in cells if key in results.cells]
+def summarise(results: Results, folds: int) -> Row:
+    """All statistics of an experiment of so many folds, in JSON."""
+    methods, names = results.methods, sorted({name for _, name in results.cells})
     complete = results.common(*methods)
     return {
         "confidence": CONFIDENCE,
         "resamples": RESAMPLES,
+        "folds": folds,
         "tasks": results.tasks,
         "methods": methods,
         "variations": results.variations,
         "variations_digest": variations_digest(results),
         "solved_at_reset": results.solved_at_reset,
-        "rates": [rate(results, *key) for key in cells],
+        "rates": [
+            rate(results, task, name) for task in results.tasks for name in methods if task in results.common(name)
+        ],
         "means": [mean(results, method, complete) for method in methods] if complete else [],
         "comparisons": [compare(results, *pair) for pair in combinations(methods, 2) if results.common(*pair)],
-        "cells": [row for key in cells for row in cost(results, *key)],
+        "updates": [row for method in results.trained for row in updates(results, method)],
+        "latent_distance": {method: latent_distance(results.of(method)) for method in results.trained},
+        "cells": [row for task in results.tasks for name in names for row in cost(results, task, name)],
     }
+
+
+def folds(profile: str) -> int:
+    """Number of folds of a profile."""
+    settings = yaml.safe_load((HERE / "profiles" / f"{profile}.yaml").read_text())
+    return len(settings.get("folds", settings.get("tasks", TASKS)))
 
 
 def main(folder: Path) -> None:
     """Writes the statistics beside the results."""
-    (folder / "summary.json").write_text(json.dumps(summarise(Results.read(folder)), indent=1) + "\n")
+    summary = summarise(Results.read(folder), folds(folder.resolve().name))
+    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -56,7 +56,10 @@ class Plan:
     training: dict[str, Cell]
     evaluation: dict[str, Cell]
     results: dict[tuple[str, str, int], str]
-    """Evaluation of each fold, method and training seed. Controls have the seed 0 alone."""
+    """Evaluation of each fold, method and training seed; controls have the seed 0 alone.
+
+    METHOD-uN is the method's weights, planned with N updates.
+    """
 
 
 def plan(profile: Mapping[str, Any], all_tasks: Iterable[str]) -> Plan:
@@ -88,7 +91,7 @@ def plan(profile: Mapping[str, Any], all_tasks: Iterable[str]) -> Plan:
                     }
                     training = digest(cell)
                     found.training[training] = cell
-                cell = {
+                base = {
                     "fold": fold,
                     "method": method,
                     "trials": profile["trials"],
@@ -96,8 +99,11 @@ def plan(profile: Mapping[str, Any], all_tasks: Iterable[str]) -> Plan:
                     "training": training,
                     "code": code["evaluation"],
                 }
-                found.evaluation[digest(cell)] = cell
-                found.results[fold, method, seed] = digest(cell)
+                searches = profile.get("updates", []) if recipe.get("plans") else []
+                variants = {f"{method}-u{n}": base | {"options": base["options"] | {"updates": n}} for n in searches}
+                for name, cell in {method: base, **variants}.items():
+                    found.evaluation[digest(cell)] = cell
+                    found.results[fold, name, seed] = digest(cell)
     return found
 
 

@@ -16,6 +16,8 @@ from typing import Any
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from lab import PROGRAMS, Lab, main, train
 
+import records
+
 Cell = dict[str, Any]  # JSON; cells.py has the fields.
 
 ELSEWHERE = {"title", "command", "planners", "models", "tasks", "trials"}
@@ -47,21 +49,17 @@ def train_fold(folder: Path, cell: Cell) -> Cell:
         with Lab(folder) as lab:
             train(lab, checkpoint, *options)
 
-    progress = json.loads((journal / "progress.jsonl").read_text().splitlines()[-1])
-    provenance = _provenance(checkpoint)
+    demonstrations = json.loads((recordings.parent / "cell.json").read_text())
     return {
         "weights": hashlib.sha256(checkpoint.read_bytes()).hexdigest(),
-        "data_digest": provenance["data_digest"],
-        "loss": progress["loss"],
-        "samples": progress["samples"],
-        # By the rate of the last process: a run that was interrupted has gaps.
-        "seconds": round(progress["samples"] / progress["samples_per_second"], 1),
+        "demonstrations": demonstrations["cell"]["episodes"],
+        **records.training(journal / "progress.jsonl", checkpoint),
     }
 
 
 def evaluate(folder: Path, cell: Cell) -> Cell:
     """Evaluates a model or a control on the fold's task."""
-    models, records, trained = folder / "models", folder / "records", None
+    models, out, trained = folder / "models", folder / "records", None
     models.mkdir(parents=True, exist_ok=True)
     if cell["training"]:
         training = folder.parents[2] / "training" / cell["fold"] / cell["training"]
@@ -74,46 +72,19 @@ def evaluate(folder: Path, cell: Cell) -> Cell:
     with Lab(folder) as lab:
         lab.planner(models)
         lab.worker("w0")
-        lab.evaluate(*options, "--out", str(records))
+        lab.evaluate(*options, "--out", str(out))
 
-    run = json.loads((records / "run.json").read_text())
-    paths = (records / "trials" / cell["fold"] / cell["method"]).glob("*.json")
+    run = json.loads((out / "run.json").read_text())
+    paths = (out / "trials" / cell["fold"] / cell["method"]).glob("*.json")
     trials = [json.loads(path.read_text()) for path in paths]
     # A variation that came to be left out later may have a record.
     trials = sorted(trials, key=lambda trial: trial["seed"])[: cell["trials"]]
-    attempts = [trial for trial in trials if trial["outcome"] in ("success", "failure")]
     return {
         "evaluator": {key: value for key, value in run.items() if key not in ELSEWHERE},
         "weights": run["models"][0]["digest"],
         "trained": trained,
-        "seeds": [trial["seed"] for trial in attempts],
-        "successes": [int(trial["outcome"] == "success") for trial in attempts],
-        "steps": [trial["episode"]["steps"] for trial in attempts],
-        "best_progress": [_best_progress(trial["episode"]) for trial in attempts],
-        "solved_at_reset": [trial["seed"] for trial in trials if trial["outcome"] == "solved-at-reset"],
-        "plan_ms": _mean_ms(attempts, "plan_seconds"),
-        "encode_ms": _mean_ms(attempts, "encode_seconds"),
+        **records.trials(trials),
     }
-
-
-def _mean_ms(trials: list[Cell], stage: str) -> float:
-    """Mean time of a stage over all plans, in milliseconds."""
-    episodes = [trial["episode"] for trial in trials]
-    total = sum(episode["steps"] * episode["mean_times"][stage] for episode in episodes)
-    return round(1e3 * total / max(1, sum(episode["steps"] for episode in episodes)), 3)
-
-
-def _best_progress(episode: Cell) -> float | None:
-    """Highest progress of an episode; none where the simulator does not measure it."""
-    progress = episode.get("progress")
-    return round(max(progress), 3) if progress else None
-
-
-def _provenance(checkpoint: Path) -> Cell:
-    """Origin of a checkpoint; docs/checkpoint-format.md has the fields."""
-    with checkpoint.open("rb") as file:
-        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-    return json.loads(header["__metadata__"]["cpn"])["provenance"]
 
 
 def _processor() -> str:

@@ -1,21 +1,13 @@
-import json
 import shutil
 from pathlib import Path
 
 import pytest
+from experiment_results import write
 
-from aggregate import Results, ResultsError, compare, main, mean, rate
+from aggregate import compare, folds, latent_distance, main, mean, rate, summarise, updates
 from cells import ROOT
 from report import report
-
-SEEDS = [1_000_000, 1_000_001, 1_000_002, 1_000_003]
-
-
-def write(folder: Path, task: str, method: str, successes: list[int], seed: int = 0, seeds: list[int] = SEEDS) -> None:
-    trials = {"seeds": seeds, "successes": successes, "steps": [10, 20, 30, 40], "best_progress": [0.1, 0.2, 0.3, 1.0]}
-    cell = {"cell": {"method": method}, **trials, "solved_at_reset": []}
-    (folder / task).mkdir(parents=True, exist_ok=True)
-    (folder / task / f"{method}-{seed}.json").write_text(json.dumps(cell))
+from results import Results, ResultsError
 
 
 def test_a_rate_pools_the_training_seeds_and_has_the_interval_of_wilson(tmp_path: Path) -> None:
@@ -76,13 +68,44 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
         Results.read(tmp_path)
 
 
+def test_the_curve_of_updates_is_over_tasks_with_all_of_them(tmp_path: Path) -> None:
+    for task, successes in (("a", [1, 1, 0, 0]), ("b", [1, 0, 0, 0])):
+        write(tmp_path, task, "cpn", successes)
+        write(tmp_path, task, "cpn", [0, 0, 0, 0], updates=0)
+        write(tmp_path, task, "cpn", [1, 1, 1, 1], updates=20)
+    write(tmp_path, "c", "cpn", [1, 1, 1, 1])
+    write(tmp_path, "a", "te-bc", [1, 0, 0, 0])
+    results = Results.read(tmp_path)
+    rows = updates(results, "cpn")
+    assert [(row["updates"], row["mean"], row["tasks"]) for row in rows] == [(0, 0, 2), (1, 0.375, 2), (20, 1, 2)]
+    assert updates(results, "te-bc") == []
+    # They are no methods of their own in tables and comparisons, but cells with a cost.
+    summary = summarise(results, 3)
+    assert summary["methods"] == ["te-bc", "cpn"]
+    assert "cpn-u20" in {cell["method"] for cell in summary["cells"]}
+
+
+def test_latent_distances_are_pooled_over_episodes() -> None:
+    cells = [
+        {"latent_distance": {"success": [[0, 4.0, 3]], "failure": [[0, 2.0, 1], [5, 1.0, 1]]}},
+        {"latent_distance": {"success": [[0, 8.0, 1]], "failure": []}},
+    ]
+    assert latent_distance(cells) == {"success": [[0, 5.0, 4]], "failure": [[0, 2.0, 1], [5, 1.0, 1]]}
+
+
+def test_the_folds_of_a_profile_are_known() -> None:
+    assert (folds("smoke"), folds("desk")) == (2, 24)
+
+
 @pytest.mark.parametrize("folder", sorted(ROOT.glob("docs/results/leave_one_out/*")), ids=lambda folder: folder.name)
 def test_the_committed_reports_are_those_of_the_committed_results(folder: Path, tmp_path: Path) -> None:
     made = tmp_path / folder.name
     for path in folder.glob("*/*.json"):
         (made / path.parent.name).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, made / path.parent.name)
+    if (folder / "pairs").exists():
+        shutil.copytree(folder / "pairs", made / "pairs", dirs_exist_ok=True)
     main(made)
     report(made)
-    for name in ("summary.json", "report.md", "report.html", "success.svg"):
-        assert (made / name).read_text() == (folder / name).read_text(), name
+    for path in folder.glob("*.*"):
+        assert (made / path.name).read_text() == path.read_text(), path.name

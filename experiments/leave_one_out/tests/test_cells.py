@@ -40,6 +40,22 @@ def test_only_what_decides_a_cell_changes_its_name() -> None:
         assert after.results["a", "random", 0] == before.results["a", "random", 0]
 
 
+def test_a_method_that_plans_is_evaluated_with_each_number_of_updates_and_the_same_weights() -> None:
+    before = plan(profile(folds=["a"]), TASKS)
+    recipes = {
+        "bc": {"preset": "paper-bc"},
+        "cpn": {"preset": "paper-cpn", "plans": True, "evaluation": {"samples": 7}},
+    }
+    methods = {"recipes": recipes, "methods": list(recipes)}
+    found = plan(profile(folds=["a"], updates=[0, 20], **methods), TASKS)
+    assert found.training == before.training
+    assert {method for _, method, _ in found.results} == {"bc", "cpn", "cpn-u0", "cpn-u20"}
+    cell = found.evaluation[found.results["a", "cpn-u20", 1]]
+    assert (cell["method"], cell["options"]) == ("cpn", {"samples": 7, "updates": 20})
+    # Without a number of its own a method stays the same cell.
+    assert found.results["a", "cpn", 1] == plan(profile(folds=["a"], **methods), TASKS).results["a", "cpn", 1]
+
+
 def test_methods_that_differ_in_their_evaluation_share_their_weights() -> None:
     recipes = {"cpn": {"preset": "paper-cpn"}, "cpn-u0": {"preset": "paper-cpn", "evaluation": {"updates": 0}}}
     found = plan(profile(recipes=recipes, methods=["cpn", "cpn-u0"], seeds=[0]), TASKS)

@@ -15,8 +15,11 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
+from PIL import Image, ImageChops, ImageStat
 
+import pairs
 from cells import ROOT
+from results import Results
 
 HERE = ROOT / "experiments/leave_one_out"
 NOTHING = "Nothing to be done"
@@ -87,17 +90,53 @@ def test_a_killed_experiment_goes_on_and_every_cell_says_what_it_is_made_of(fold
         path.relative_to(folder / "smoke"): json.loads(path.read_text()) for path in folder.glob("smoke/*/*.json")
     }
     profile = yaml.safe_load((HERE / "profiles/smoke.yaml").read_text())
-    assert len(results) == len(profile["folds"]) * len(profile["methods"]) * len(profile["seeds"])
+    # One of its methods plans.
+    evaluated = len(profile["methods"]) + len(profile["updates"])
+    assert len(results) == len(profile["folds"]) * evaluated * len(profile["seeds"])
     for path, result in results.items():
         assert result["cell"]["fold"] == path.parts[0]
         assert len(result["seeds"]) == len(result["successes"]) == len(result["steps"]) == 2
+        for points in result["latent_distance"].values():
+            assert all(step % 5 == 0 for step, *_ in points)
         if result["cell"]["method"] in {"bc", "cpn"}:
+            assert any(result["latent_distance"].values())
+            assert result["trained"]["curve"][-1][0] == result["trained"]["samples"]
             assert result["weights"] == result["trained"]["weights"]
             assert result["trained"]["cell"]["settings"]["training.epochs"] == 1
             assert len(result["trained"]["data_digest"]) == 64
     report = (folder / "smoke/report.html").read_text()
     assert report.startswith("<!doctype html>")
-    assert not re.search(r'(src|href)="[^#]', report), "not self-contained"
+    assert not re.search(r'(src|href)="(?!#|data:)', report), "not self-contained"
+
+
+def test_a_pair_of_episodes_is_drawn_from_their_recordings(folder: Path, tmp_path: Path) -> None:
+    results = tmp_path / "smoke"
+    shutil.copytree(folder / "smoke", results)
+    for method, successes in (("bc", [0, 0]), ("cpn", [0, 1])):
+        path = results / f"door-lock/{method}-0.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"successes": successes}))
+    pairs.main(results, folder)
+    (pair,) = (pair for pair in json.loads((results / "pairs/pairs.json").read_text()) if pair["task"] == "door-lock")
+    seed = Results.read(results).variations["door-lock"][1]
+    assert (pair["seed"], pair["solved"], pair["failed"]) == (seed, "cpn", "bc")
+
+    strip, animation = (Image.open(results / "pairs" / pair[kind]) for kind in ("strip", "animation"))
+    assert strip.size == (7 * 84, 2 * 84)
+    goals, first, last = (strip.crop((x * 84, 0, (x + 1) * 84, 168)) for x in (0, 1, 6))
+    assert difference(goals.crop((0, 0, 84, 84)), goals.crop((0, 84, 84, 168))) < 2, "one goal"
+    assert difference(first.crop((0, 0, 84, 84)), first.crop((0, 84, 84, 168))) < 2, "one variation"
+    assert difference(first, last) > 1, "the arm moves"
+    assert animation.size == (3 * 84, 84)
+    assert getattr(animation, "n_frames", 1) > 1
+
+    shutil.rmtree(results / "pairs")
+    pairs.main(results, tmp_path)
+    assert json.loads((results / "pairs/pairs.json").read_text()) == [], "no recordings, no pairs"
+
+
+def difference(a: Image.Image, b: Image.Image) -> float:
+    """Mean absolute difference of the pixels, of 255."""
+    return ImageStat.Stat(ImageChops.difference(a.convert("L"), b.convert("L"))).mean[0]
 
 
 def test_a_folder_has_one_run_at_a_time(folder: Path) -> None:
@@ -140,5 +179,5 @@ def slurm_answers() -> bool:
 def test_the_experiment_runs_through_slurm_and_is_finished_there_too(tmp_path: Path) -> None:
     log = run(tmp_path, "--executor", "slurm", "--cores", "2")
     assert "has been submitted with SLURM jobid" in log
-    assert len(list(tmp_path.glob("smoke/*/*.json"))) == 6
+    assert (tmp_path / "smoke/report.html").exists()
     assert NOTHING in run(tmp_path, "--executor", "slurm", "--cores", "2", "--dry-run")
