@@ -29,13 +29,8 @@ def read_table(text: str) -> Counts:
 
 def differences(expected: Counts, got: Counts) -> list[str]:
     """A line for each task and model whose counts are not those expected."""
-    cells = [*expected, *(got.keys() - expected.keys())]
-    return [
-        f"{task}, {model}: expected {_count(expected, key)}, got {_count(got, key)}"
-        for key in cells
-        if expected.get(key) != got.get(key)
-        for task, model in [key]
-    ]
+    cells = [key for key in expected | got if expected.get(key) != got.get(key)]
+    return [f"{', '.join(key)}: expected {_count(expected, key)}, got {_count(got, key)}" for key in cells]
 
 
 def _count(counts: Counts, key: tuple[str, str]) -> str:
