@@ -73,8 +73,8 @@ def distance(summary: Summary) -> Figure | None:
             points = summary["latent_distance"][method][outcome]
             steps, means = [point[0] for point in points], [point[1] for point in points]
             axis.plot(steps, means, color=colour, label=outcome, marker="." if len(points) == 1 else None)
-        axis.set_ylim(bottom=0)
         axis.grid(color="0.9")
+    axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("mean latent distance", fontsize=9)
     axes[0].legend(fontsize=8, frameon=False)
     figure.supxlabel("step", fontsize=9)
@@ -82,7 +82,7 @@ def distance(summary: Summary) -> Figure | None:
 
 
 def updates(summary: Summary) -> Figure | None:
-    """Mean success rate with its interval by the number of updates, each with the time of its plans."""
+    """Mean success rate with its interval by the number of updates, each with the time of the search."""
     methods = list(dict.fromkeys(row["method"] for row in summary["updates"]))
     if not methods:
         return None
@@ -97,7 +97,7 @@ def updates(summary: Summary) -> Figure | None:
         axis.grid(axis="y", color="0.9")
     axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("mean success rate", fontsize=9)
-    figure.supxlabel("updates U, and the time of a plan", fontsize=9)
+    figure.supxlabel("updates U, and the time of the search", fontsize=9)
     return figure
 
 

@@ -67,7 +67,7 @@ def best(results: Results, _: int, __: list[str]) -> list[str]:
     if not winners:
         return [f"none of {len(tasks)} tasks solved" if tasks else NOT_RUN]
     counts = ", ".join(f"{method} {sum(method in names for names in winners)}" for method in results.trained)
-    return [f"most successes, of {len(winners)} solved tasks, ties counted for each: {counts}"]
+    return [f"tasks solved by any: {len(winners)}; with the most successes, ties for each: {counts}"]
 
 
 def best_at(results: Results, _: int, tasks: list[str]) -> list[str]:
@@ -80,7 +80,7 @@ def best_at(results: Results, _: int, tasks: list[str]) -> list[str]:
     others = [task for task in complete if task not in tasks]
     means = {name: sum(results.outcomes(task, name).mean() for task in others) for name in results.trained if others}
     shares = ", ".join(f"{name} {100 * total / len(others):.1f} %" for name, total in means.items())
-    return [*lines, f"mean over {len(others)} others: {shares or NOT_RUN}"]
+    return [*lines, f"mean over the other tasks ({len(others)}): {shares or NOT_RUN}"]
 
 
 def _complete(results: Results) -> list[str]:
