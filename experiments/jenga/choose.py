@@ -7,8 +7,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from cpn_sim_worker import keys
 from planning import Planner, along, demonstrations, network
+
+from cpn_sim_worker import keys
 
 
 def choose(endpoint: str, planner_name: str, out: Path, episodes: list[str], models: list[str]) -> tuple[int, int]:

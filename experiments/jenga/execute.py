@@ -17,20 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
+from planning import Array, Demonstration, Planner, along, demonstrations, network, request
+
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.jenga import ACTION_METRES
 from cpn_sim_worker.session import UnavailableError
 from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED
-from planning import (
-    Array,
-    Demonstration,
-    Planner,
-    along,
-    demonstrations,
-    network,
-    request,
-)
 
 VARIATIONS = {"jenga-poke": 21, "jenga-poke-offset": 24}
 """Seven fresh starts for each of the three trained targets, four for each of the six that are offset in height."""

@@ -9,13 +9,14 @@ from typing import TypeVar
 
 import numpy as np
 import zenoh
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
 from cpn.v1 import demonstration_pb2, planner_pb2, types_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.jenga import ACTION_METRES
 from cpn_sim_worker.session import UnavailableError, ZenohConfig, ask, open_session
 from cpn_sim_worker.wire import decode
-from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 START_SECONDS = 60.0
 """How long services may take to start."""

@@ -27,7 +27,7 @@ STRIP_FRAMES = 6
 ANIMATION_FRAMES = 25
 ANIMATION_MS = 120
 """Time of a frame of an animation."""
-QUALITY = 60
+QUALITY = 70
 """Of JPEG and WebP."""
 
 
