@@ -6,7 +6,7 @@
 
 use super::packing::{BLayout, NR_VECTORS, WIDE_NR_VECTORS};
 use crate::engine::simd::element::{Element, Operand};
-use crate::engine::simd::vector::{Vector, VectorShape};
+use crate::engine::simd::vector::Vector;
 use pulp::{Simd, WithSimd};
 use std::ops::Range;
 
@@ -62,11 +62,7 @@ impl<E: Operand> Gemm<'_, E> {
 
     /// All rows, in panels of W vectors.
     fn all_rows<const W: usize>(&mut self) {
-        // As many rows at once as the registers hold sums for, besides vectors of b and an element of a.
-        let mut row = 0;
-        if VectorShape::of::<E>().registers >= 32 {
-            row = self.row_tiles::<8, W>(row);
-        }
+        let mut row = self.row_tiles::<8, W>(0);
         row = self.row_tiles::<6, W>(row);
         row = self.row_tiles::<4, W>(row);
         row = self.row_tiles::<2, W>(row);
@@ -75,13 +71,10 @@ impl<E: Operand> Gemm<'_, E> {
         }
     }
 
-    /// Tiles of R rows from `row` on, while R rows are left; returns the row after them.
+    /// Tiles of R rows from `row` on, while R rows are left and if the registers hold so many; returns the row after them.
     fn row_tiles<const R: usize, const W: usize>(&mut self, row: usize) -> usize {
         let end = row + (self.rows - row) / R * R;
-        if end > row {
-            E::dispatch(RowTiles::<E, R, W> { gemm: self, rows: row..end });
-        }
-        end
+        if end > row { E::dispatch(RowTiles::<E, R, W> { gemm: self, rows: row..end }) } else { row }
     }
 
     /// The contribution of indices along the inner dimension to a tile of c, R rows and P panels; `first` replaces c, else it is
@@ -139,7 +132,17 @@ impl<E: Operand> Gemm<'_, E> {
     }
 }
 
-/// Kernel for tiles of R rows.
+/// True if the registers hold the sums of a tile, besides vectors of b and an element of a.
+const fn fits<S: Simd>(rows: usize, vectors: usize) -> bool {
+    let sums = match S::REGISTER_COUNT {
+        _ if S::IS_SCALAR => 4,
+        32.. => 24,
+        _ => 12,
+    };
+    rows * vectors <= sums
+}
+
+/// Kernel for tiles of R rows. Its result is the row after them.
 #[derive(Debug)]
 struct RowTiles<'a, 'b, E: Operand, const R: usize, const W: usize> {
     gemm: &'a mut Gemm<'b, E>,
@@ -147,11 +150,16 @@ struct RowTiles<'a, 'b, E: Operand, const R: usize, const W: usize> {
 }
 
 impl<E: Operand, const R: usize, const W: usize> WithSimd for RowTiles<'_, '_, E, R, W> {
-    type Output = ();
+    type Output = usize;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
+    fn with_simd<S: Simd>(self, simd: S) -> usize {
         let Self { gemm, rows } = self;
+        // As a constant: larger tiles are not compiled.
+        if const { !fits::<S>(R, W) } {
+            return rows.start;
+        }
+
         let b = gemm.b;
         let width = W * Vector::<S, E::Sum>::COUNT;
         let mut workspace = edge_tile(b.columns, width);
@@ -167,6 +175,7 @@ impl<E: Operand, const R: usize, const W: usize> WithSimd for RowTiles<'_, '_, E
                 gemm.tile::<S, R, 1, W>(simd, (row, panel), !gemm.accumulate, indices, workspace);
             }
         }
+        rows.end
     }
 }
 
