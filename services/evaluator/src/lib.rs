@@ -42,6 +42,7 @@ use anyhow::{Context, bail, ensure};
 use control::Control;
 use link::Link;
 use record::FIRST_EVALUATION_SEED;
+use service_kit::network;
 use service_kit::session::Connection;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -146,7 +147,8 @@ async fn models(
         for planner in planners {
             let key = key::planner_list_models(planner)?;
             // Right after connecting, the services of a planner that is alive may not be known yet.
-            let response: ListModelsResponse = link::ask(session, &key, ListModelsRequest, timeout, patience)
+            let retry = link::retry(patience);
+            let response: ListModelsResponse = network::ask(session, &key, ListModelsRequest, timeout, retry)
                 .await
                 .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
             served.push((planner.as_str(), response.models));

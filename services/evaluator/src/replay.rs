@@ -4,6 +4,7 @@ use crate::cli::ReplayArgs;
 use crate::{link, presence};
 use anyhow::Context;
 use recording::plans::{self, Exchange};
+use service_kit::network;
 use std::fmt;
 use std::time::Duration;
 use tokio::time::Instant;
@@ -68,7 +69,7 @@ pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     let mut difference = None;
     for (step, exchange) in exchanges.iter().enumerate() {
         let request = again(&recorded.episode().goal, exchange);
-        let now = link::ask(&session, &key, request, PATIENCE, RECOVERY);
+        let now = network::ask(&session, &key, request, PATIENCE, link::retry(RECOVERY));
         let now = now.await.with_context(|| format!("step {step}"))?;
         difference = compare(step, exchange, now);
         if difference.is_some() {

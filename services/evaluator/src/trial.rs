@@ -2,11 +2,12 @@
 
 use crate::actor::{self, Actor};
 use crate::control::Control;
-use crate::link::{Link, is_outage};
+use crate::link::Link;
 use crate::presence::Service;
 use crate::record::{self, GoalSource, Model, Outcome, Run, StageTimes};
 use anyhow::bail;
 use recording::plans::Plans;
+use service_kit::network::is_outage;
 use wire::planner::PlanResponse;
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
 use wire::{Code, Error, Image, key};
