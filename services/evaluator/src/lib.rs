@@ -3,8 +3,8 @@
 //!
 //! Every model, and every control (`control`), is run on the same variations (`queue`), one trial at a time on each worker
 //! (`schedule`, `trial`, `actor`), spread over the planners (`planners`), with plans as they are set (`planning`). Outages of routers and services are waited for (`link`, `presence`), or the trial begins
-//! anew from its seed, so that the results are the same as without. The records (`record`, `filmstrip`) are all that the
-//! report (`summary`, `table`, `report`) is made from, so that a run can be interrupted and gone on with. Two
+//! anew from its seed, so that the results are the same as without. The records (`record`) are all that the
+//! report (`summary`, `table`, `report`, `filmstrip`) is made from, so that a run can be interrupted and gone on with. Two
 //! models on the same variations are compared by them (`compare`, `paired`). What a planner was asked in an episode can be asked
 //! again (`replay`).
 
