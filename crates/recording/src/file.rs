@@ -107,6 +107,8 @@ pub(crate) struct Reader<R> {
     bytes: usize,
     /// Whether the summary section has been reached, which only repeats the data section.
     in_summary: bool,
+    /// Message that was looked at, and not read yet.
+    peeked: Option<Message>,
 }
 
 impl<R: Read> Reader<R> {
@@ -118,10 +120,13 @@ impl<R: Read> Reader<R> {
             .with_validate_summary_section_crc(true)
             .with_record_length_limit(MAX_BYTES);
         let (reader, channels) = (LinearReader::new_with_options(options), Channels::default());
-        Self { source, reader, channels, bytes: 0, in_summary: false }
+        Self { source, reader, channels, bytes: 0, in_summary: false, peeked: None }
     }
 
     fn next(&mut self) -> Result<Option<Message>, ReadError> {
+        if self.peeked.is_some() {
+            return Ok(self.peeked.take());
+        }
         while let Some(event) = self.reader.next_event() {
             match event? {
                 LinearReadEvent::ReadRequest(bytes) => {
@@ -141,6 +146,12 @@ impl<R: Read> Reader<R> {
             }
         }
         Ok(None)
+    }
+
+    /// Whether the next message is of this topic.
+    pub(crate) fn next_is(&mut self, topic: Topic) -> Result<bool, ReadError> {
+        self.peeked = self.next()?;
+        Ok(self.peeked.as_ref().is_some_and(|message| message.channel.topic == topic.name()))
     }
 
     /// Reads the next message, which must be of this topic and its schema.

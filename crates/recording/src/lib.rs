@@ -1,15 +1,16 @@
 //! Recordings: one episode per MCAP file, readable by Foxglove, Rerun and every MCAP library.
 //!
 //! [`Episode`] is a validated demonstration; [`to_bytes`] and [`from_bytes`] encode and decode its file. The messages are
-//! Foxglove's `RawImage` at `/camera`, and those of `proto/cpn/v1/demonstration.proto`. [`plans`] are recordings of an
-//! episode's plan requests and responses, with the messages of `proto/cpn/v1/replay.proto`.
+//! Foxglove's `RawImage` at `/camera`, and those of `proto/cpn/v1/demonstration.proto`. [`trial`] has recordings of
+//! trials: frames, plan requests and responses, with the messages of `proto/cpn/v1/{trial,planner}.proto`.
 
+mod camera;
 mod episode;
 mod file;
-pub mod plans;
 mod read;
 mod records;
 mod topic;
+pub mod trial;
 mod write;
 
 pub use episode::Episode;

@@ -1,15 +1,14 @@
 //! Decoding of episodes from untrusted files.
 
 use crate::Episode;
+use crate::camera::frame;
 use crate::file::{ReadError, Reader, bytes, check, check_size};
-use crate::topic::{PIXELS, Topic, log_time_nanos};
-use foxglove::messages::RawImage;
-use prost::Message as _;
+use crate::topic::{Topic, log_time_nanos};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 use wire::demonstration::{RecordedEpisode, RecordedStep};
-use wire::{Error, Image, decode};
+use wire::{Error, decode};
 
 /// Decodes a recording: a header, then each step's frame and the step, in order.
 ///
@@ -22,8 +21,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Episode, ReadError> {
     let mut steps = Vec::new();
     for number in 0..info.steps {
         let time = log_time_nanos(number, info.control_hz);
-        let frame = frame(&of_step(&mut reader, Topic::Camera, number, time)?)
-            .and_then(|frame| frame.rendered_as(&info.render_spec))
+        let frame = frame(&of_step(&mut reader, Topic::Camera, number, time)?, &info.render_spec)
             .map_err(|e| e.within(&format!("/camera[{number}]")))?;
         let step: RecordedStep = decode(&of_step(&mut reader, Topic::Step, number, time)?)
             .map_err(|e: Error| e.within(&format!("/step[{number}]")))?;
@@ -60,11 +58,4 @@ fn of_step(reader: &mut Reader<impl Read>, topic: Topic, number: u32, time: u64)
     let place = |number, nanos| format!("number {number} at {nanos} ns");
     check(topic.name(), &place(number, time), &place(message.sequence, message.log_time))?;
     Ok(message.data)
-}
-
-fn frame(bytes: &[u8]) -> Result<Image, Error> {
-    let image = RawImage::decode(bytes).map_err(|e| Error::invalid("payload", "foxglove.RawImage", e))?;
-    check("encoding", PIXELS, &image.encoding)?;
-    check("step", &image.width.saturating_mul(3).to_string(), &image.step.to_string())?;
-    Image::new(image.height, image.width, image.data.into())
 }

@@ -8,22 +8,18 @@ use wire::proto;
 
 /// Encoding of messages and schemas.
 pub(crate) const ENCODING: &str = "protobuf";
-/// Pixel format, as [`RawImage`] names it.
-pub(crate) const PIXELS: &str = "rgb8";
-/// Name of the camera's frame of reference.
-pub(crate) const FRAME_ID: &str = "camera";
 
 /// Topics, each with its message type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Topic {
     /// `cpn.v1.RecordedEpisode`, first and once.
     Episode,
-    /// `foxglove.RawImage`, before the step of the same time.
+    /// `foxglove.RawImage`, before the step or the plan request of the same number.
     Camera,
     /// `cpn.v1.RecordedStep`.
     Step,
-    /// `cpn.v1.PlannedEpisode`, first and once.
-    PlannedEpisode,
+    /// `cpn.v1.RecordedTrial`, first and once.
+    Trial,
     /// `cpn.v1.PlanRequest`.
     PlanRequest,
     /// `cpn.v1.PlanResponse`, after its request.
@@ -33,7 +29,7 @@ pub(crate) enum Topic {
 impl Topic {
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Self::Episode | Self::PlannedEpisode => "/episode",
+            Self::Episode | Self::Trial => "/episode",
             Self::Camera => "/camera",
             Self::Step => "/step",
             Self::PlanRequest => "/plan/request",
@@ -47,7 +43,7 @@ impl Topic {
             Self::Episode => proto::RecordedEpisode::full_name(),
             Self::Camera => schema_of_camera().name,
             Self::Step => proto::RecordedStep::full_name(),
-            Self::PlannedEpisode => proto::PlannedEpisode::full_name(),
+            Self::Trial => proto::RecordedTrial::full_name(),
             Self::PlanRequest => proto::PlanRequest::full_name(),
             Self::PlanResponse => proto::PlanResponse::full_name(),
         }
@@ -58,7 +54,7 @@ impl Topic {
         match self {
             Self::Camera => schema_of_camera().data.into_owned(),
             Self::Episode | Self::Step => schema_of("cpn/v1/demonstration.proto"),
-            Self::PlannedEpisode => schema_of("cpn/v1/replay.proto"),
+            Self::Trial => schema_of("cpn/v1/trial.proto"),
             Self::PlanRequest | Self::PlanResponse => schema_of("cpn/v1/planner.proto"),
         }
     }

@@ -1,9 +1,9 @@
 //! Encoding of episodes.
 
 use crate::Episode;
+use crate::camera::raw_image;
 use crate::file::Writer;
-use crate::topic::{FRAME_ID, PIXELS, Topic, log_time_nanos};
-use foxglove::messages::{RawImage, Timestamp};
+use crate::topic::{Topic, log_time_nanos};
 use mcap::McapError;
 use wire::demonstration::{DemonstrationStep, RecordedStep};
 use wire::proto;
@@ -19,23 +19,10 @@ pub fn to_bytes(episode: &Episode) -> Result<Vec<u8>, McapError> {
     writer.end_chunk()?;
     for step in episode.steps() {
         let time = log_time_nanos(step.step, episode.info().control_hz);
-        writer.write(Topic::Camera, step.step, time, &raw_image(step, time))?;
+        writer.write(Topic::Camera, step.step, time, &raw_image(&step.frame, time))?;
         writer.write(Topic::Step, step.step, time, &recorded_step(step))?;
     }
     writer.finish()
-}
-
-fn raw_image(DemonstrationStep { frame, .. }: &DemonstrationStep, time: u64) -> RawImage {
-    let seconds = u32::try_from(time / 1_000_000_000).unwrap_or(u32::MAX);
-    RawImage {
-        timestamp: Some(Timestamp::new(seconds, (time % 1_000_000_000) as u32)),
-        frame_id: FRAME_ID.to_owned(),
-        width: frame.width(),
-        height: frame.height(),
-        encoding: PIXELS.to_owned(),
-        step: frame.width() * 3,
-        data: frame.data().to_vec().into(),
-    }
 }
 
 fn recorded_step(step: &DemonstrationStep) -> proto::RecordedStep {

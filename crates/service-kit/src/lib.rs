@@ -1,5 +1,5 @@
-//! Infrastructure shared by all services: configuration, files, logs, metrics, output, shutdown, a zenoh session, and listeners
-//! with TLS and access control for gRPC and others.
+//! Infrastructure shared by all services: configuration, files, logs, metrics, output, shutdown, a zenoh session with
+//! queryables, requests and names, and listeners with TLS and access control for gRPC and others.
 
 pub mod access;
 pub mod changes;
@@ -8,6 +8,7 @@ pub mod files;
 pub mod grpc;
 pub mod listener;
 pub mod metrics;
+pub mod network;
 pub mod output;
 pub mod process;
 pub mod session;

@@ -15,21 +15,14 @@ use tokio::sync::{oneshot, watch};
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::task::AbortOnDropHandle;
 use tracing::{info, warn};
-use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::{Session, Wait};
 
 /// Interval of the warning that nothing is connected.
 const REMINDER: Duration = Duration::from_secs(5);
 /// Pause of a client between two tries of its routers.
 const RETRY: Duration = Duration::from_secs(1);
-/// Interval of checks of connection and liveliness.
+/// Interval of checks of the connection.
 const CHECK_INTERVAL: Duration = Duration::from_millis(500);
-/// Wait for the first connection before a name can count as free.
-const FIRST_CONNECTION: Duration = Duration::from_secs(1);
-/// Consecutive checks without a token after which a name counts as free.
-const FREE_CHECKS: u32 = 2;
-/// Longest time for which a dead process's liveliness token lingers: zenoh's lease, with a margin.
-const LEASE: Duration = Duration::from_secs(15);
 /// Largest message after defragmentation, in bytes: a request to load a model may carry its checkpoint.
 const MAX_MESSAGE_BYTES: usize = 66 << 20;
 
@@ -206,7 +199,7 @@ impl SessionConfig {
     }
 
     /// Whether a connection is expected: there are endpoints to connect to, or the mode is client.
-    fn expects_connection(&self) -> bool {
+    pub(crate) fn expects_connection(&self) -> bool {
         let seeks = || {
             let zenoh = self.zenoh()?;
             let connect = endpoints(&zenoh, "connect/endpoints", &mode(&zenoh)?)?;
@@ -286,6 +279,21 @@ fn endpoints(config: &zenoh::Config, key: &str, mode: &str) -> anyhow::Result<Ve
     Ok(found)
 }
 
+/// Conversion of zenoh's errors, which are boxed and therefore not converted by `?`.
+pub trait IntoAnyhow<T> {
+    /// The result with an error of `anyhow`.
+    ///
+    /// # Errors
+    /// Zenoh's error.
+    fn into_anyhow(self) -> anyhow::Result<T>;
+}
+
+impl<T> IntoAnyhow<T> for zenoh::Result<T> {
+    fn into_anyhow(self) -> anyhow::Result<T> {
+        self.map_err(anyhow::Error::from_boxed)
+    }
+}
+
 /// Opens a session. A client waits for its router, with a warning every few seconds.
 ///
 /// # Errors
@@ -313,7 +321,7 @@ pub async fn open(config: &SessionConfig) -> anyhow::Result<Session> {
     reminder.tick().await;
     loop {
         tokio::select! {
-            session = &mut opened => return session?.map_err(|e| anyhow!(e)).context("opening the zenoh session"),
+            session = &mut opened => return session?.into_anyhow().context("opening the zenoh session"),
             _ = reminder.tick() => warn!(endpoints = reached, "no router answers; trying again"),
         }
     }
@@ -366,44 +374,4 @@ impl Connection {
     pub fn connected(&self) -> watch::Receiver<bool> {
         self.connected.clone()
     }
-}
-
-/// Waits until a liveliness token is free; that of a killed process lingers for a while. Two processes that start at the same
-/// moment can both succeed.
-///
-/// # Errors
-/// If the token is held for longer than zenoh's lease: each of two services of one name would get a part of the requests.
-pub async fn claim(session: &Session, config: &SessionConfig, token: &OwnedKeyExpr) -> anyhow::Result<()> {
-    let (start, expects_connection) = (Instant::now(), config.expects_connection());
-    let (mut free_checks, mut waiting) = (0, false);
-    loop {
-        // Tokens are invisible before a connection and, for a moment, through a router that was just restarted.
-        let connected = !expects_connection || is_connected(session).await;
-        let held = is_held(session, token).await?;
-        free_checks = if held { 0 } else { free_checks + 1 };
-        let unseen = !connected && start.elapsed() < FIRST_CONNECTION;
-        if !expects_connection && !held || free_checks >= FREE_CHECKS && !unseen {
-            return Ok(());
-        }
-
-        if held && !waiting {
-            warn!(%token, "a service of this name is running or has just died; waiting for it to go");
-            waiting = true;
-        }
-        ensure!(
-            start.elapsed() < LEASE || !held,
-            "name: expected one that no running service has, got that of {token}"
-        );
-        tokio::time::sleep(CHECK_INTERVAL).await;
-    }
-}
-
-async fn is_held(session: &Session, token: &OwnedKeyExpr) -> anyhow::Result<bool> {
-    let holders = session.liveliness().get(token).timeout(Duration::from_secs(2)).await.map_err(|e| anyhow!(e))?;
-    while let Ok(holder) = holders.recv_async().await {
-        if holder.result().is_ok() {
-            return Ok(true);
-        }
-    }
-    Ok(false)
 }

@@ -14,11 +14,11 @@ mod message;
 mod observation;
 pub mod planner;
 pub mod query;
-pub mod replay;
 mod search;
 pub mod sim;
 pub mod trace;
 pub mod training;
+pub mod trial;
 
 pub use error::{Code, Error};
 pub use image::Image;

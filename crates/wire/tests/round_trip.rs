@@ -9,9 +9,9 @@ use std::time::Duration;
 use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
-use wire::replay::*;
 use wire::sim::*;
 use wire::training::*;
+use wire::trial::*;
 use wire::{Image, Message, Position, decode, encode};
 
 fn image() -> impl Strategy<Value = Image> {
@@ -178,14 +178,15 @@ proptest! {
     }
 
     #[test]
-    fn planned_episode(
+    fn trials(
         variation in variation(),
         model in name(),
-        model_digest in digest(),
-        goal in prop_oneof![image().prop_map(Into::into), point().prop_map(Into::into)],
-        plans in 1u32..,
+        (model_digest, plans) in prop_oneof![(digest(), 0u32..), Just((String::new(), 0))],
+        goal in image(),
+        goal_position in option::of(point()),
+        steps in 1u32..,
     ) {
-        survives(PlannedEpisode { variation, model, model_digest, goal, plans });
+        survives(RecordedTrial { variation, model, model_digest, goal, goal_position, steps, plans });
     }
 
     #[test]
@@ -310,7 +311,7 @@ proptest! {
         let _ = decode::<DemonstrationStep>(&bytes);
         let _ = decode::<CommitEpisodeRequest>(&bytes);
         let _ = decode::<RecordedEpisode>(&bytes);
-        let _ = decode::<PlannedEpisode>(&bytes);
+        let _ = decode::<RecordedTrial>(&bytes);
         let _ = decode::<CheckpointAnnouncement>(&bytes);
         let _ = decode::<ListVersionsResponse>(&bytes);
         let _ = decode::<StartRunRequest>(&bytes);

@@ -5,14 +5,14 @@
 use libfuzzer_sys::fuzz_target;
 use mcap::records::MessageHeader;
 use mcap::{Compression, McapError, Message, MessageStream, WriteOptions};
-use recording::plans::{self, Exchange, Plans};
+use recording::trial::{self, Exchange, Frame, Recording};
 use recording::{Episode, ReadError};
 use std::io::Cursor;
 use std::time::Duration;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
 use wire::planner::{Goal, PlanRequest, PlanResponse, StageTimes};
-use wire::replay::PlannedEpisode;
 use wire::sim::Variation;
+use wire::trial::RecordedTrial;
 use wire::{Image, Position};
 
 fuzz_target!(init: fuzz::seed("recording", recordings(), check), |input: &[u8]| {
@@ -21,7 +21,7 @@ fuzz_target!(init: fuzz::seed("recording", recordings(), check), |input: &[u8]| 
 
 fn check(input: &[u8]) -> Result<(), ReadError> {
     let demonstration = round_trip(input, recording::from_bytes, recording::to_bytes);
-    demonstration.or_else(|_| round_trip(input, plans::from_bytes, plans::to_bytes))
+    demonstration.or_else(|_| round_trip(input, trial::from_bytes, trial::to_bytes))
 }
 
 /// Checks a round trip. Bytes are compared, since plans may contain NaN.
@@ -39,8 +39,9 @@ fn round_trip<T>(
 /// Recordings as written, and copies without checksums, which allow mutations.
 fn recordings() -> Vec<Vec<u8>> {
     let demonstration = recording::to_bytes(&demonstration()).expect("an episode can be written");
-    let plans = plans::to_bytes(&plans()).expect("plans can be written");
-    [demonstration, plans]
+    let [images, positions] =
+        [trial(None), trial(Some(position()))].map(|it| trial::to_bytes(&it).expect("a trial can be written"));
+    [demonstration, images, positions]
         .into_iter()
         .flat_map(|whole| [flat(&whole), chunked(&whole), compressed(&whole), whole])
         .collect()
@@ -80,7 +81,7 @@ fn demonstration() -> Episode {
     let step = |step: u32| DemonstrationStep {
         episode_id: "reach-5".into(),
         step,
-        frame: Image::new(1, 2, vec![step as u8; 6]).expect("an image"),
+        frame: image(step as u8),
         action: (step < 2).then(|| vec![0.25, -1.0]),
         state: vec![0.5],
         reward: 1.0,
@@ -99,30 +100,48 @@ fn demonstration() -> Episode {
     Episode::new(info, steps).expect("an episode")
 }
 
-fn plans() -> Plans {
-    let position = Position::new([0.5, -0.25, 0.125]).expect("a position");
+/// Trial with two plans, from images or positions.
+fn trial(goal_position: Option<Position>) -> Recording {
     let model_digest = "0".repeat(64);
+    let trial = RecordedTrial {
+        variation: variation(),
+        model: "cpn".into(),
+        model_digest: model_digest.clone(),
+        goal: image(9),
+        goal_position,
+        steps: 3,
+        plans: 2,
+    };
     let response = PlanResponse {
         actions: vec![vec![0.25, -1.0]; 2],
         first_action: vec![0.25, -1.0],
         inner_losses: vec![0.5, 0.25],
         latent_distance: Some(1.5),
         times: StageTimes { queue_seconds: 0.1, encode_seconds: 0.2, plan_seconds: 0.3 },
-        model_digest: model_digest.clone(),
+        model_digest,
         goal_id: "0".repeat(64),
         iterations: 1,
         iterations_run: 1,
         warm_start: Vec::new(),
     };
-    let exchange = Exchange {
-        request: PlanRequest::new("cpn", Goal::Position(position), position.into()),
+    let goal = || goal_position.map_or_else(|| Goal::Id(image(9).digest()), Goal::Position);
+    let exchange = |step: u32| Exchange {
+        step,
+        request: PlanRequest::new("cpn", goal(), goal_position.map_or_else(|| image(step as u8).into(), Into::into)),
         asked: Duration::from_millis(1),
-        response,
+        response: response.clone(),
         answered: Duration::from_millis(2),
     };
-    let (variation, model, goal) = (variation(), "cpn".into(), position.into());
-    let episode = PlannedEpisode { variation, model, model_digest, goal, plans: 2 };
-    Plans::new(episode, vec![exchange; 2]).expect("plans that fit together")
+    let frame = |step: u8| Frame { image: image(step), time: Duration::from_millis(step.into()) };
+    Recording::new(trial, (0..4).map(frame).collect(), [0, 2].map(exchange).into()).expect("a trial that fits together")
+}
+
+fn image(shade: u8) -> Image {
+    Image::new(1, 2, vec![shade; 6]).expect("an image")
+}
+
+fn position() -> Position {
+    Position::new([0.5, -0.25, 0.125]).expect("a position")
 }
 
 fn variation() -> Variation {

@@ -3,6 +3,7 @@
 use crate::identities::Identities;
 use anyhow::Context;
 use serde_json::{Value, json};
+use service_kit::session::IntoAnyhow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use wire::access::{ENDPOINTS, Endpoint, Kind, Role};
@@ -89,7 +90,7 @@ fn keys(endpoint: &Endpoint, namespaces: &BTreeSet<String>) -> anyhow::Result<Ve
     }
     let below = |namespace: &String| {
         let key = zenoh::key_expr::KeyExpr::new(format!("{namespace}/{key}"));
-        Ok(key.map_err(|e| anyhow::anyhow!(e)).with_context(|| format!("namespace {namespace}"))?.to_string())
+        Ok(key.into_anyhow().with_context(|| format!("namespace {namespace}"))?.to_string())
     };
     namespaces.iter().map(below).collect()
 }

@@ -6,11 +6,10 @@ use crate::planning::Planning;
 use crate::presence::Service;
 use crate::record::Model;
 use crate::trial::Fault;
-use recording::plans::{Exchange, Plans};
+use recording::trial::Exchange;
 use std::time::Instant;
 use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
-use wire::replay::PlannedEpisode;
-use wire::sim::{ResetResponse, Variation};
+use wire::sim::ResetResponse;
 use wire::{Code, Error, Image, Observation, Position, key};
 
 /// Source of an episode's actions: a planner or a control.
@@ -35,14 +34,14 @@ impl<'a> Actor<'a> {
         planning: &'a Planning,
         seed: u64,
         reset: &ResetResponse,
+        start: Instant,
     ) -> Result<Self, Fault> {
         if let Some(control) = Control::of(model) {
             return Ok(Self::Control(control));
         }
-        let start = Instant::now();
         let goal = link.goal(&planner, reset).await.map_err(|error| Fault::new(planner.clone(), error))?;
-        let (warm_start, exchanges, plan_steps) = (Vec::new(), Vec::new(), Vec::new());
-        let planned = Planned { link, planner, model, planning, seed, start, goal, warm_start, exchanges, plan_steps };
+        let (warm_start, exchanges) = (Vec::new(), Vec::new());
+        let planned = Planned { link, planner, model, planning, seed, start, goal, warm_start, exchanges };
         Ok(Self::Planned(Box::new(planned)))
     }
 
@@ -60,17 +59,12 @@ impl<'a> Actor<'a> {
         }
     }
 
-    /// Recorded plan requests with their answers, and [`record::Episode::plan_steps`].
-    ///
-    /// # Errors
-    /// If the answers do not fit together.
-    pub(crate) fn end(self, variation: &Variation, reset: &ResetResponse) -> Result<(Option<Plans>, Vec<u32>), Fault> {
-        let Self::Planned(planner) = self else { return Ok((None, Vec::new())) };
-        let mut plan_steps = planner.plan_steps.clone();
-        if plan_steps.iter().zip(0..).all(|(step, plan)| *step == plan) {
-            plan_steps.clear();
+    /// Plan requests with their answers; none of a control.
+    pub(crate) fn exchanges(self) -> Vec<Exchange> {
+        match self {
+            Self::Control(_) => Vec::new(),
+            Self::Planned(planner) => planner.exchanges,
         }
-        Ok((Some(planner.plans(variation, reset)?), plan_steps))
     }
 }
 
@@ -82,13 +76,12 @@ pub(crate) struct Planned<'a> {
     planning: &'a Planning,
     /// Of the variation.
     seed: u64,
+    /// Start of the episode.
     start: Instant,
     goal: Goal,
     /// Initial actions of the next search; the policy's if empty.
     warm_start: Vec<Vec<f32>>,
     exchanges: Vec<Exchange>,
-    /// Steps before each of them.
-    plan_steps: Vec<u32>,
 }
 
 impl Planned<'_> {
@@ -115,26 +108,9 @@ impl Planned<'_> {
             self.warm_start = moved_on(response.warm_start.clone(), applied - 1);
         }
         let times = response.times;
-        self.exchanges.push(Exchange { request, asked, response, answered: self.start.elapsed() });
-        self.plan_steps.push(step);
+        self.exchanges.push(Exchange { step, request, asked, response, answered: self.start.elapsed() });
         Ok(Decided { actions, thinking_seconds: times.queue_seconds + times.encode_seconds + times.plan_seconds })
     }
-
-    fn plans(self, variation: &Variation, reset: &ResetResponse) -> Result<Plans, Fault> {
-        let episode = PlannedEpisode {
-            variation: variation.clone(),
-            model: self.model.name.clone(),
-            model_digest: self.model.digest.clone(),
-            goal: goal(reset),
-            plans: self.exchanges.len() as u32,
-        };
-        Plans::new(episode, self.exchanges).map_err(|error| Fault::new(self.planner, error))
-    }
-}
-
-/// Goal of an episode.
-pub(crate) fn goal(reset: &ResetResponse) -> Observation {
-    reset.goal_position.map_or_else(|| reset.goal.clone().into(), Observation::from)
 }
 
 /// A plan moved on by so many more steps, its last action repeated.

@@ -3,8 +3,8 @@
 //!
 //! Every model, and every control (`control`), is run on the same variations (`queue`), one trial at a time on each worker
 //! (`schedule`, `trial`, `actor`), spread over the planners (`planners`), with plans as they are set (`planning`). Outages of routers and services are waited for (`link`, `presence`), or the trial begins
-//! anew from its seed, so that the results are the same as without. The records (`record`, `filmstrip`) are all that the
-//! report (`summary`, `table`, `report`) is made from, so that a run can be interrupted and gone on with. Two
+//! anew from its seed, so that the results are the same as without. The records (`record`) are all that the
+//! report (`summary`, `table`, `report`, `filmstrip`) is made from, so that a run can be interrupted and gone on with. Two
 //! models on the same variations are compared by them (`compare`, `paired`). What a planner was asked in an episode can be asked
 //! again (`replay`).
 
@@ -42,6 +42,7 @@ use anyhow::{Context, bail, ensure};
 use control::Control;
 use link::Link;
 use record::FIRST_EVALUATION_SEED;
+use service_kit::network;
 use service_kit::session::Connection;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -146,7 +147,8 @@ async fn models(
         for planner in planners {
             let key = key::planner_list_models(planner)?;
             // Right after connecting, the services of a planner that is alive may not be known yet.
-            let response: ListModelsResponse = link::ask(session, &key, ListModelsRequest, timeout, patience)
+            let retry = link::retry(patience);
+            let response: ListModelsResponse = network::ask(session, &key, ListModelsRequest, timeout, retry)
                 .await
                 .with_context(|| format!("asking planner \"{planner}\" for its models"))?;
             served.push((planner.as_str(), response.models));

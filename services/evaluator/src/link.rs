@@ -5,19 +5,17 @@
 
 use crate::presence::{self, Alive, Service};
 use anyhow::bail;
-use backon::{ExponentialBuilder, Retryable};
 use service_kit::SessionConfig;
-use std::time::{Duration, Instant};
+use service_kit::network::{Retry, ask, is_outage};
+use std::time::Duration;
 use tokio::sync::watch;
-use wire::{Code, Error, Message, query};
+use wire::{Code, Error, Message};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
 /// Time for which a service may be away, while others of its kind are there, before it is taken as gone. After a router's
 /// restart the tokens come back one by one, within a second or two.
 const GRACE: Duration = Duration::from_secs(5);
-/// Delays between two tries.
-const DELAYS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
 /// The way to the planners and the workers.
 #[derive(Debug, Clone)]
@@ -43,13 +41,18 @@ impl Link {
     ) -> Result<R, Error> {
         tokio::select! {
             biased;
-            answer = ask(&self.session, &key, request, self.timeout, self.recovery) => answer,
+            answer = ask(&self.session, &key, request, self.timeout, retry(self.recovery)) => answer,
             () = presence::gone(self.alive.clone(), service, GRACE) => {
                 let got = format!("none for {} s, while others are alive", GRACE.as_secs());
                 Err(Error::new(Code::Unavailable, key.as_str(), format!("{service} to be alive"), got))
             }
         }
     }
+}
+
+/// Retries until so long after the first outage.
+pub(crate) fn retry(patience: Duration) -> Retry {
+    Retry { delays: [Duration::from_millis(200), Duration::from_secs(1)], patience, when: is_outage }
 }
 
 /// Joins the others.
@@ -66,40 +69,14 @@ pub(crate) async fn join(config: &SessionConfig, patience: Duration) -> anyhow::
     }
 }
 
-/// Asks, and asks again until so long after the first outage.
-///
-/// # Errors
-/// The service's answer, or the error of the last outage.
-pub(crate) async fn ask<Q: Message + Clone, R: Message>(
-    session: &Session,
-    key: &OwnedKeyExpr,
-    request: Q,
-    timeout: Duration,
-    recovery: Duration,
-) -> Result<R, Error> {
-    let [shortest, longest] = DELAYS;
-    let again = ExponentialBuilder::default().with_min_delay(shortest).with_max_delay(longest).without_max_times();
-    let mut first = None;
-    let call = || query::call(session, key, request.clone(), timeout);
-    call.retry(again)
-        .when(|error: &Error| is_outage(error) && first.get_or_insert_with(Instant::now).elapsed() < recovery)
-        .notify(|error, _| tracing::debug!("asking again: {error}"))
-        .await
-}
-
-/// Whether an error is of the moment, so that the very same request may be answered later.
-pub(crate) fn is_outage(error: &Error) -> bool {
-    matches!(error.code, Code::Unavailable | Code::DeadlineExceeded | Code::ResourceExhausted)
-}
-
 #[cfg(test)]
 #[expect(clippy::unwrap_used, reason = "a test")]
 mod tests {
     use super::*;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
-    use wire::key;
     use wire::sim::{ResetRequest, ResetResponse, Variation};
+    use wire::{key, query};
     use zenoh::Wait;
     use zenoh::query::Query;
 

@@ -1,6 +1,7 @@
 //! Live planners and workers, by liveliness tokens.
 
-use anyhow::{anyhow, bail};
+use anyhow::{Context, bail};
+use service_kit::session::IntoAnyhow;
 use std::collections::BTreeSet;
 use std::fmt;
 use std::future::pending;
@@ -82,7 +83,7 @@ async fn subscribe(
     callback: impl Fn(Sample) + Send + Sync + 'static,
 ) -> anyhow::Result<()> {
     let subscriber = session.liveliness().declare_subscriber(key).history(true).callback(callback).background();
-    subscriber.await.map_err(|error| anyhow!(error).context("following liveliness tokens"))
+    subscriber.await.into_anyhow().context("following liveliness tokens")
 }
 
 fn update(names: &mut BTreeSet<String>, name: &str, kind: SampleKind) {

@@ -3,7 +3,7 @@
 use crate::control::Control;
 use crate::planning::Planning;
 use anyhow::{Context, ensure};
-use recording::plans::{self, Plans};
+use recording::trial::{self, Recording};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
 use service_kit::files::{self, write_atomically};
@@ -258,11 +258,20 @@ impl Folder {
         write_json(&self.trial_path(&trial.task, &trial.model, trial.seed), trial)
     }
 
-    /// Keeps the plans of a trial beside its record, in place of any earlier ones.
-    pub(crate) fn write_plans(&self, plans: &Plans) -> anyhow::Result<()> {
-        let episode = plans.episode();
-        let record = self.trial_path(&episode.variation.task, &episode.model, episode.variation.seed);
-        write_atomically(&record.with_extension(recording::EXTENSION), &plans::to_bytes(plans)?)
+    /// Writes the recording of a trial beside its record, over any earlier one.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn write_recording(&self, recording: &Recording) -> anyhow::Result<()> {
+        let trial = recording.trial();
+        let record = self.trial_path(&trial.variation.task, &trial.model, trial.variation.seed);
+        write_atomically(&record.with_extension(recording::EXTENSION), &trial::to_bytes(recording)?)
+    }
+
+    /// Reads the recording of a trial.
+    pub(crate) fn read_recording(&self, trial: &Trial) -> anyhow::Result<Recording> {
+        let record = self.trial_path(&trial.task, &trial.model, trial.seed);
+        read_recording(&record.with_extension(recording::EXTENSION))
     }
 
     /// Remembers that a variation has no goal image: it is left out for all models.
@@ -341,12 +350,18 @@ impl Folder {
 }
 
 /// The names in a folder of the run; none if there is no such folder yet.
-pub(crate) fn file_names(folder: &Path) -> anyhow::Result<Vec<String>> {
+fn file_names(folder: &Path) -> anyhow::Result<Vec<String>> {
     if !folder.try_exists().with_context(|| folder.display().to_string())? {
         return Ok(Vec::new());
     }
     let name = |path: PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     Ok(files::list(folder)?.into_iter().map(name).collect())
+}
+
+/// Reads the recording of a trial.
+pub(crate) fn read_recording(path: &Path) -> anyhow::Result<Recording> {
+    let remedy = "remove the trial's record and run it again";
+    trial::read(path).with_context(|| format!("{}: expected the recording of a trial; {remedy}", path.display()))
 }
 
 pub(crate) fn write_json<T: Serialize>(path: &Path, value: &T) -> anyhow::Result<()> {

@@ -1,9 +1,10 @@
 //! A recorded episode, played back through a planner: the same requests must get the same answers, bit for bit.
 
 use crate::cli::ReplayArgs;
-use crate::{link, presence};
-use anyhow::Context;
-use recording::plans::{self, Exchange};
+use crate::{link, presence, record};
+use anyhow::{Context, ensure};
+use recording::trial::Exchange;
+use service_kit::network;
 use std::fmt;
 use std::time::Duration;
 use tokio::time::Instant;
@@ -53,10 +54,12 @@ impl fmt::Display for Replay {
 /// Asks a planner again for every plan of a recorded episode, from the same checkpoint, and compares the answers.
 ///
 /// # Errors
-/// If the file does not hold the plans of an episode, the planner does not come up, or it refuses a request, as it does
+/// If the file is not the recording of a trial, or of one without plans; if the planner does not come up, or it refuses a request, as it does
 /// without the checkpoint.
 pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
-    let recorded = plans::read(&args.file).with_context(|| args.file.display().to_string())?;
+    let recorded = record::read_recording(&args.file)?;
+    let (trial, exchanges) = (recorded.trial(), recorded.exchanges());
+    ensure!(!exchanges.is_empty(), "{}: expected plans, got a trial of {}", args.file.display(), trial.model);
     let start = Instant::now();
     let session = link::join(&args.session, WAIT).await?;
     let planners = [args.planner.clone()];
@@ -64,11 +67,10 @@ pub async fn replay(args: &ReplayArgs) -> anyhow::Result<Replay> {
     presence::wait(&session, &mut alive, &planners, 0, start, WAIT).await?;
 
     let key = key::planner_plan(&args.planner)?;
-    let exchanges = recorded.exchanges();
     let mut difference = None;
     for (step, exchange) in exchanges.iter().enumerate() {
-        let request = again(&recorded.episode().goal, exchange);
-        let now = link::ask(&session, &key, request, PATIENCE, RECOVERY);
+        let request = again(&trial.planned_goal(), exchange);
+        let now = network::ask(&session, &key, request, PATIENCE, link::retry(RECOVERY));
         let now = now.await.with_context(|| format!("step {step}"))?;
         difference = compare(step, exchange, now);
         if difference.is_some() {
@@ -170,7 +172,7 @@ mod tests {
             iterations_run: 4,
             warm_start: vec![vec![0.5; 3]; 2],
         };
-        Exchange { request, asked: Duration::ZERO, response, answered: Duration::ZERO }
+        Exchange { step: 0, request, asked: Duration::ZERO, response, answered: Duration::ZERO }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The report as one HTML file that needs nothing else.
 
 use crate::chart::{BarChart, Line};
-use crate::filmstrip::{self, Filmstrip};
+use crate::filmstrip::Filmstrip;
 use crate::record::{Folder, Outcome, Run, Trial};
 use crate::summary::{Row, Summary};
 use crate::table::DEMONSTRATION_SEEDS;
@@ -93,7 +93,7 @@ struct Frame {
 /// The report of a run.
 ///
 /// # Errors
-/// If frames cannot be read.
+/// If the template is faulty.
 pub(crate) fn html(summary: &Summary, trials: &[Trial], folder: &Folder) -> anyhow::Result<String> {
     let models = summary.run.models.len();
     let mut rows = Vec::new();
@@ -103,8 +103,8 @@ pub(crate) fn html(summary: &Summary, trials: &[Trial], folder: &Folder) -> anyh
             row,
             training_label: row.training.label(),
             colour: colour(&summary.run, index % models),
-            success: strip(&of_row, &Outcome::Success, folder)?,
-            failure: strip(&of_row, &Outcome::Failure, folder)?,
+            success: strip(&of_row, &Outcome::Success, folder),
+            failure: strip(&of_row, &Outcome::Failure, folder),
         });
     }
     let page = Page {
@@ -147,30 +147,30 @@ fn colour(run: &Run, index: usize) -> String {
     if is_control { format!("g{}", before % GREYS) } else { format!("c{}", before % COLOURS) }
 }
 
-/// The filmstrip of the first trial with an outcome.
-fn strip(trials: &[&Trial], outcome: &Outcome, folder: &Folder) -> anyhow::Result<Option<Strip>> {
-    for trial in trials.iter().filter(|trial| trial.outcome == *outcome) {
-        let (Some(filmstrip), Some(episode)) = (filmstrip::read(folder, trial)?, &trial.episode) else { continue };
-        let Filmstrip { goal, frames } = filmstrip;
-        let ms = |seconds: f64| 1e3 * seconds;
-        let distances = episode.latent_distances.iter().enumerate();
-        let distances: Vec<_> = distances.map(|(plan, distance)| (episode.plan_step(plan), *distance)).collect();
-        let progress: Vec<_> = (0..).zip(episode.progress.iter().map(|value| Some(*value as f32))).collect();
-        return Ok(Some(Strip {
-            seed: trial.seed,
-            steps: episode.steps,
-            goal: STANDARD.encode(goal),
-            distance: Line::new(&distances, episode.steps, frames.len()),
-            progress: Line::new(&progress, episode.steps, frames.len()),
-            frames: frames.into_iter().map(|(step, png)| Frame { step, png: STANDARD.encode(png) }).collect(),
-            first_inner_losses: episode.first_inner_losses.clone(),
-            last_inner_losses: episode.last_inner_losses.clone(),
-            encode_ms: ms(episode.mean_times.encode_seconds),
-            plan_ms: ms(episode.mean_times.plan_seconds),
-            queue_ms: ms(episode.mean_times.queue_seconds),
-        }));
-    }
-    Ok(None)
+/// The filmstrip of the first trial with an outcome; none if its recording cannot be read.
+fn strip(trials: &[&Trial], outcome: &Outcome, folder: &Folder) -> Option<Strip> {
+    let trial = trials.iter().find(|trial| trial.outcome == *outcome)?;
+    let episode = trial.episode.as_ref()?;
+    let Filmstrip { goal, frames } =
+        Filmstrip::of(trial, folder).inspect_err(|error| tracing::warn!("no filmstrip: {error:#}")).ok()?;
+
+    let ms = |seconds: f64| 1e3 * seconds;
+    let distances = episode.latent_distances.iter().enumerate();
+    let distances: Vec<_> = distances.map(|(plan, distance)| (episode.plan_step(plan), *distance)).collect();
+    let progress: Vec<_> = (0..).zip(episode.progress.iter().map(|value| Some(*value as f32))).collect();
+    Some(Strip {
+        seed: trial.seed,
+        steps: episode.steps,
+        goal: STANDARD.encode(goal),
+        distance: Line::new(&distances, episode.steps, frames.len()),
+        progress: Line::new(&progress, episode.steps, frames.len()),
+        frames: frames.into_iter().map(|(step, png)| Frame { step, png: STANDARD.encode(png) }).collect(),
+        first_inner_losses: episode.first_inner_losses.clone(),
+        last_inner_losses: episode.last_inner_losses.clone(),
+        encode_ms: ms(episode.mean_times.encode_seconds),
+        plan_ms: ms(episode.mean_times.plan_seconds),
+        queue_ms: ms(episode.mean_times.queue_seconds),
+    })
 }
 
 /// Seeds as ranges: `1000000–1000003, 1000005`.

@@ -1,12 +1,11 @@
 //! Hands trials to the workers that are alive, one at a time each.
 
-use crate::filmstrip;
 use crate::link::Link;
 use crate::planners::Planners;
 use crate::presence::{Alive, Service};
 use crate::progress::Progress;
 use crate::queue::{Job, MAX_FAULTS, MAX_OUTAGES, Queue};
-use crate::record::{FORMAT, Folder, Outcome, Run, Trial};
+use crate::record::{Episode, FORMAT, Folder, Outcome, Run, Trial};
 use crate::trial::{self, Attempt, Fault, Services};
 use anyhow::{Context, bail};
 use std::collections::{BTreeMap, BTreeSet};
@@ -159,11 +158,8 @@ impl Schedule {
             _ if self.queue.is_skipped(&job.variation) => (),
             Ok(attempt) => {
                 // Before the record, which says that the trial is finished.
-                if let Some(plans) = &attempt.plans {
-                    self.folder.write_plans(plans)?;
-                }
-                let trial = self.record(&job, attempt.outcome.clone(), Some(&attempt))?;
-                filmstrip::keep(&self.folder, &trial, &attempt.goal, &attempt.frames)?;
+                self.folder.write_recording(&attempt.recording)?;
+                self.record(&job, attempt.outcome.clone(), Some(attempt.episode))?;
                 self.progress.count(job.model, attempt.outcome == Outcome::Success);
             }
             Err(Fault::SolvedAtReset) => {
@@ -203,7 +199,7 @@ impl Schedule {
         Ok(())
     }
 
-    fn record(&self, job: &Job, outcome: Outcome, attempt: Option<&Attempt>) -> anyhow::Result<Trial> {
+    fn record(&self, job: &Job, outcome: Outcome, episode: Option<Episode>) -> anyhow::Result<()> {
         let model = &self.run.models[job.model];
         let trial = Trial {
             format: FORMAT,
@@ -214,10 +210,9 @@ impl Schedule {
             goal: self.run.goal,
             planning: self.run.planning,
             outcome,
-            episode: attempt.map(|attempt| attempt.episode.clone()),
+            episode,
         };
-        self.folder.write_trial(&trial)?;
-        Ok(trial)
+        self.folder.write_trial(&trial)
     }
 
     fn give_up(mut self, patience: Duration) -> anyhow::Result<()> {

@@ -2,14 +2,17 @@
 
 use crate::actor::{self, Actor};
 use crate::control::Control;
-use crate::link::{Link, is_outage};
+use crate::link::Link;
 use crate::presence::Service;
 use crate::record::{self, GoalSource, Model, Outcome, Run, StageTimes};
 use anyhow::bail;
-use recording::plans::Plans;
+use recording::trial::{Exchange, Frame, Recording};
+use service_kit::network::is_outage;
+use std::time::{Duration, Instant};
 use wire::planner::PlanResponse;
 use wire::sim::{ResetRequest, ResetResponse, StepRequest, StepResponse, Variation};
-use wire::{Code, Error, Image, key};
+use wire::trial::RecordedTrial;
+use wire::{Code, Error, key};
 
 /// Variations that are tried for the goal of an ablation.
 const GOAL_TRIES: u32 = 10;
@@ -28,12 +31,7 @@ pub(crate) struct Services {
 pub(crate) struct Attempt {
     pub(crate) outcome: Outcome,
     pub(crate) episode: record::Episode,
-    /// Image of the finished task.
-    pub(crate) goal: Image,
-    /// Every frame from the first on, one more than steps.
-    pub(crate) frames: Vec<Image>,
-    /// Plan requests with their answers; none of a control.
-    pub(crate) plans: Option<Plans>,
+    pub(crate) recording: Recording,
 }
 
 /// Why an attempt came to no end.
@@ -140,16 +138,17 @@ pub(crate) async fn attempt(
         return Err(Fault::SolvedAtReset);
     }
     let planner = Service::Planner(planner.clone());
-    let mut actor = Actor::new(link, planner, model, &run.planning, variation.seed, &reset).await?;
+    let start = Instant::now();
+    let mut actor = Actor::new(link, planner, model, &run.planning, variation.seed, &reset, start).await?;
 
     let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
     let mut hand = reset.hand_position;
-    let mut frames = vec![reset.observation.clone()];
+    let mut frames = vec![Frame { image: reset.observation.clone(), time: Duration::ZERO }];
     let mut progress = vec![reset.progress];
     let mut step = 0;
     let mut held = vec![0.0; reset.control.action_size as usize];
     while step < reset.max_steps {
-        let mut decided = actor.decide(&reset, step, &frames[frames.len() - 1], hand).await?;
+        let mut decided = actor.decide(&reset, step, &frames[frames.len() - 1].image, hand).await?;
         if run.planning.real_time {
             let steps = (decided.thinking_seconds * reset.control.hz).ceil().max(1.0) as usize;
             let next = decided.actions.swap_remove(0);
@@ -161,13 +160,22 @@ pub(crate) async fn attempt(
             let response: StepResponse = link.call(&worker, step_key.clone(), request).await.map_err(by_worker)?;
             step += 1;
             hand = response.hand_position;
-            frames.push(response.observation);
+            frames.push(Frame { image: response.observation, time: start.elapsed() });
             progress.push(response.progress);
             if response.done {
                 let outcome = if response.success { Outcome::Success } else { Outcome::Failure };
-                let (plans, plan_steps) = actor.end(variation, &reset)?;
-                let episode = record::Episode { steps: step, progress, plan_steps, ..course(&reset, plans.as_ref()) };
-                return Ok(Attempt { outcome, episode, goal: reset.goal, frames, plans });
+                let exchanges = actor.exchanges();
+                let trial = RecordedTrial {
+                    variation: variation.clone(),
+                    model: model.name.clone(),
+                    model_digest: model.digest.clone(),
+                    goal: reset.goal,
+                    goal_position: reset.goal_position,
+                    steps: step,
+                    plans: exchanges.len() as u32,
+                };
+                let recording = Recording::new(trial, frames, exchanges).map_err(Fault::Refused)?;
+                return Ok(Attempt { outcome, episode: course(&recording, progress), recording });
             }
         }
     }
@@ -194,9 +202,11 @@ impl Link {
     }
 }
 
-/// Statistics of an episode's plans, if there are any.
-fn course(reset: &ResetResponse, plans: Option<&Plans>) -> record::Episode {
-    let plans: Vec<_> = plans.iter().flat_map(|plans| plans.exchanges()).map(|exchange| &exchange.response).collect();
+/// The course of an episode, with statistics of its plans if there are any.
+fn course(recording: &Recording, progress: Vec<f64>) -> record::Episode {
+    let (trial, exchanges) = (recording.trial(), recording.exchanges());
+    let plans: Vec<_> = exchanges.iter().map(|exchange| &exchange.response).collect();
+    let is_before_every_step = exchanges.iter().zip(0..).all(|(Exchange { step, .. }, plan)| *step == plan);
     let finite = |value: f32| value.is_finite().then_some(value);
     let inner_losses = |plan: Option<&&PlanResponse>| {
         plan.iter().flat_map(|plan| &plan.inner_losses).map(|&loss| finite(loss)).collect()
@@ -205,10 +215,10 @@ fn course(reset: &ResetResponse, plans: Option<&Plans>) -> record::Episode {
         plans.iter().map(|plan| seconds(plan)).sum::<f64>() / plans.len().max(1) as f64
     };
     record::Episode {
-        goal_id: actor::goal(reset).digest(),
-        steps: 0,
-        progress: Vec::new(),
-        plan_steps: Vec::new(),
+        goal_id: trial.planned_goal().digest(),
+        steps: trial.steps,
+        progress,
+        plan_steps: exchanges.iter().map(|exchange| exchange.step).filter(|_| !is_before_every_step).collect(),
         latent_distances: plans.iter().filter_map(|plan| plan.latent_distance).map(finite).collect(),
         first_inner_losses: inner_losses(plans.first()),
         last_inner_losses: inner_losses(plans.last()),
@@ -229,10 +239,9 @@ mod tests {
     use service_kit::SessionConfig;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
-    use std::time::Duration;
     use tokio::sync::watch;
     use wire::planner::{PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
-    use wire::{Position, query, sim};
+    use wire::{Image, Position, query, sim};
     use zenoh::Session;
     use zenoh::key_expr::OwnedKeyExpr;
     use zenoh::query::Query;
@@ -368,9 +377,9 @@ mod tests {
         let (link, registered) = forgetful().await;
         let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &default_run()).await.unwrap();
         assert_eq!(registered.load(Ordering::SeqCst), 2);
-        assert_eq!((attempt.outcome, attempt.frames.len()), (Outcome::Success, 4));
-        let plans = attempt.plans.unwrap();
-        assert_eq!((plans.exchanges().len(), &plans.episode().goal), (3, &image(255).into()));
+        let recording = attempt.recording;
+        assert_eq!((attempt.outcome, recording.frames().len()), (Outcome::Success, 4));
+        assert_eq!((recording.exchanges().len(), &recording.trial().goal), (3, &image(255)));
         let episode = attempt.episode;
         assert_eq!((episode.steps, episode.latent_distances), (3, vec![Some(1.0); 3]));
         assert_eq!((episode.progress, episode.plan_steps), (vec![0.0, 0.0, 0.25, 0.5], vec![]));
@@ -419,24 +428,24 @@ mod tests {
             let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &run).await.unwrap();
             let tenths = |value: &f64| (10.0 * value).round() as i32;
             let applied: Vec<_> = attempt.episode.progress[1..].iter().map(tenths).collect();
-            (applied, attempt.episode.plan_steps, attempt.plans.unwrap())
+            (applied, attempt.episode.plan_steps, attempt.recording)
         };
         let default = Planning::default();
-        let (applied, _, plans) = planned(Planning { updates: Some(20), ..default }).await;
+        let (applied, _, recording) = planned(Planning { updates: Some(20), ..default }).await;
         assert_eq!(applied, [0, 3, 5]);
-        assert!(plans.exchanges().iter().all(|exchange| exchange.response.iterations_run == 20));
+        assert!(recording.exchanges().iter().all(|exchange| exchange.response.iterations_run == 20));
         // Each plan begins one action further on.
-        let (applied, steps, plans) = planned(Planning { warm_start: true, ..default }).await;
+        let (applied, steps, recording) = planned(Planning { warm_start: true, ..default }).await;
         assert_eq!((applied, steps), (vec![0, 1, 2], vec![]));
-        assert!(plans.exchanges().iter().all(|exchange| exchange.request.search.is_none()));
+        assert!(recording.exchanges().iter().all(|exchange| exchange.request.search.is_none()));
         // Two actions of the first plan, then the second plan, from the third action on.
-        let (applied, steps, plans) = planned(Planning { apply_actions: 2, warm_start: true, ..default }).await;
-        assert_eq!((applied, steps, plans.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));
+        let (applied, steps, recording) = planned(Planning { apply_actions: 2, warm_start: true, ..default }).await;
+        assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));
         let tenths = |action: &Vec<f32>| (10.0 * action[0]).round() as i32;
-        assert_eq!(plans.exchanges()[1].request.warm_start.iter().map(tenths).collect::<Vec<_>>(), [2, 2, 2]);
+        assert_eq!(recording.exchanges()[1].request.warm_start.iter().map(tenths).collect::<Vec<_>>(), [2, 2, 2]);
         // A plan takes half a second here, five steps of the simulation: none acts before the episode ends.
-        let (applied, steps, plans) = planned(Planning { real_time: true, ..default }).await;
-        assert_eq!((applied, steps, plans.exchanges().len()), (vec![0, 0, 0], vec![], 1));
+        let (applied, steps, recording) = planned(Planning { real_time: true, ..default }).await;
+        assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 0, 0], vec![], 1));
     }
 
     #[tokio::test(flavor = "multi_thread")]
@@ -446,7 +455,8 @@ mod tests {
         for (control, applied) in [(Control::NoOp, [0.0; 3]), (Control::Oracle, [1.0; 3])] {
             let attempt =
                 attempt(&link, &services, &control.model(), &variation("reach", 1), &default_run()).await.unwrap();
-            assert_eq!((attempt.plans, attempt.episode.steps), (None, 3));
+            assert_eq!((attempt.recording.exchanges().len(), attempt.recording.frames().len()), (0, 4));
+            assert_eq!(attempt.episode.steps, 3);
             assert_eq!(attempt.episode.progress[1..], applied);
             assert_eq!(attempt.episode.goal_id, image(255).digest());
         }

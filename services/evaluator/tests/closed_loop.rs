@@ -103,11 +103,11 @@ async fn every_model_is_run_on_the_same_variations_and_reported() {
     }
 
     // Nothing is left to do, so that nothing changes.
-    let (trials, frames) = (files(&out.join("trials")), files(&out.join("frames")));
+    let trials = files(&out.join("trials"));
     let ended = lab.evaluate(&[&arguments[..], &["--json"]].concat()).await;
     assert!(ended.success);
     assert!(ended.stderr.contains("4 of 4 trials are there already"));
-    assert_eq!((files(&out.join("trials")), files(&out.join("frames"))), (trials, frames));
+    assert_eq!(files(&out.join("trials")), trials);
     let summary: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
     assert_eq!(summary["rows"][1]["trials"], 2);
     lab.stop_planner().await;
@@ -135,7 +135,11 @@ async fn controls_stand_beside_models_whose_plans_are_set() {
     let (rest, line, steps) = (progress(&rest), progress(&line), line["episode"]["steps"].as_u64().unwrap());
     assert_eq!((rest.len(), line.len() as u64), (61, steps + 1));
     assert!((rest[0] - line[0]).abs() < 1e-12 && rest[60] < rest[0] + 0.01 && line[line.len() - 1] > 0.9);
-    assert!(!lab.out().join("trials/reach/oracle/1000000.mcap").exists(), "no planner was asked");
+    let file = lab.out().join("trials/reach/oracle/1000000.mcap");
+    let recorded = recording::trial::read(&file).unwrap();
+    assert_eq!((recorded.frames().len() as u64, recorded.exchanges().len()), (steps + 1, 0), "no planner was asked");
+    let refused = lab.replay(&file).await;
+    assert!(refused.stderr.contains("1000000.mcap: expected plans, got a trial of oracle"), "{}", refused.stderr);
 
     assert_eq!(cpn["planning"]["updates"], 2);
     let episode = &cpn["episode"];
@@ -145,10 +149,11 @@ async fn controls_stand_beside_models_whose_plans_are_set() {
     );
     assert_eq!(episode["last_inner_losses"].as_array().unwrap().len(), 3, "before each update and after the last");
     let file = lab.out().join("trials/reach/cpn/1000000.mcap");
-    let plans = recording::plans::read(&file).unwrap();
-    let starts: Vec<_> = plans.exchanges().iter().map(|exchange| &exchange.request.warm_start).collect();
+    let recorded = recording::trial::read(&file).unwrap();
+    assert_eq!((recorded.frames().len(), recorded.exchanges()[1].step), (61, 2), "frames between plans are there");
+    let starts: Vec<_> = recorded.exchanges().iter().map(|exchange| &exchange.request.warm_start).collect();
     assert!(starts[0].is_empty());
-    assert_eq!(starts[1][0], plans.exchanges()[0].response.actions[2], "two actions further on");
+    assert_eq!(starts[1][0], recorded.exchanges()[0].response.actions[2], "two actions further on");
     let replayed = lab.replay(&file).await;
     assert_eq!((replayed.success, replayed.stdout.as_str()), (true, "30 plans: bit for bit the same\n"));
 
@@ -181,12 +186,12 @@ async fn in_real_time_the_first_plan_comes_too_late_for_the_first_step() {
     assert!(lab.evaluate(&arguments).await.success);
     let [line, cpn] = ["oracle", "cpn"].map(|model| record(&lab.out(), &format!("reach/{model}/1000000.json")));
     assert_eq!((&line["planning"]["real_time"], &line["episode"]["steps"]), (&true.into(), &12.into()));
-    let plans = recording::plans::read(&lab.out().join("trials/reach/cpn/1000000.mcap")).unwrap();
+    let recorded = recording::trial::read(&lab.out().join("trials/reach/cpn/1000000.mcap")).unwrap();
     let late = |times: wire::planner::StageTimes| {
         let seconds = times.queue_seconds + times.encode_seconds + times.plan_seconds;
         (80.0 * seconds).ceil().max(1.0) as u64
     };
-    let waits: Vec<_> = plans.exchanges().iter().map(|exchange| late(exchange.response.times)).collect();
+    let waits: Vec<_> = recorded.exchanges().iter().map(|exchange| late(exchange.response.times)).collect();
     let (last, before) = waits.split_last().unwrap();
     let before: u64 = before.iter().sum();
     assert!(before < 12 && before + last >= 12, "{waits:?}");

@@ -6,7 +6,7 @@ mod common;
 
 use common::{Ended, LIMIT};
 use planner::Planner;
-use recording::plans;
+use recording::trial;
 use service_kit::SessionConfig;
 use service_kit::session::Mode;
 use std::collections::BTreeMap;
@@ -214,9 +214,9 @@ fn results(out: &Path) -> BTreeMap<PathBuf, (serde_json::Value, Exchanges)> {
         }
         let mut record: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
         record["episode"].as_object_mut().expect("an episode").remove("mean_times").unwrap();
-        let plans = plans::read(&path.with_extension(recording::EXTENSION)).unwrap();
+        let recorded = trial::read(&path.with_extension(recording::EXTENSION)).unwrap();
         let timeless = |plan: &PlanResponse| PlanResponse { times: Default::default(), ..plan.clone() };
-        let exchanges = plans.exchanges().iter().map(|it| (it.request.clone(), timeless(&it.response))).collect();
+        let exchanges = recorded.exchanges().iter().map(|it| (it.request.clone(), timeless(&it.response))).collect();
         results.insert(path.strip_prefix(out).unwrap().to_owned(), (record, exchanges));
     }
     results

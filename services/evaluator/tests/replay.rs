@@ -5,7 +5,7 @@
 mod common;
 
 use common::{LIMIT, Lab};
-use recording::plans::{self, Plans};
+use recording::trial::{self, Exchange, Recording};
 use service_kit::SessionConfig;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -82,12 +82,19 @@ async fn recorded(task: &str, model: &str) -> (Lab, PathBuf) {
     (lab, file)
 }
 
+fn with_exchanges(recorded: &Recording, exchanges: Vec<Exchange>) -> Recording {
+    Recording::new(recorded.trial().clone(), recorded.frames().to_vec(), exchanges).unwrap()
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn an_episode_comes_back_bit_for_bit() {
     for (task, model) in [("reach", "cpn"), ("jenga-poke", "jenga"), ("reach", "random")] {
         let (mut lab, file) = recorded(task, model).await;
-        let plans = plans::read(&file).unwrap();
-        assert_eq!((plans.episode().variation.task.as_str(), plans.episode().plans), (task, STEPS));
+        let recorded = trial::read(&file).unwrap();
+        assert_eq!((recorded.trial().variation.task.as_str(), recorded.trial().plans), (task, STEPS));
+        let pictures: Vec<_> = (0..=STEPS).map(picture).collect();
+        let frames = recorded.frames().iter().map(|frame| frame.image.clone());
+        assert_eq!(frames.collect::<Vec<_>>(), pictures, "with every frame");
         // A planner that has just started has never seen the goal.
         for lab in [&mut lab, &mut Lab::start(0).await] {
             let ended = lab.replay(&file).await;
@@ -101,8 +108,8 @@ async fn an_episode_comes_back_bit_for_bit() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_search_until_its_deadline_comes_back() {
     let (mut lab, file) = recorded("reach", "cpn").await;
-    let plans = plans::read(&file).unwrap();
-    let mut exchanges = plans.exchanges().to_vec();
+    let recorded = trial::read(&file).unwrap();
+    let mut exchanges = recorded.exchanges().to_vec();
     let session = worker(&lab).await;
     let planners =
         session.liveliness().declare_subscriber(key::planner_alive("*").unwrap()).history(true).await.unwrap();
@@ -114,8 +121,8 @@ async fn a_search_until_its_deadline_comes_back() {
         let plan = key::planner_plan("planner").unwrap();
         exchange.response = query::call(&session, &plan, exchange.request.clone(), LIMIT).await.unwrap();
     }
-    let searched = Plans::new(plans.episode().clone(), exchanges).unwrap();
-    std::fs::write(&file, plans::to_bytes(&searched).unwrap()).unwrap();
+    let searched = with_exchanges(&recorded, exchanges);
+    std::fs::write(&file, trial::to_bytes(&searched).unwrap()).unwrap();
     let ended = lab.replay(&file).await;
     assert_eq!((ended.success, ended.stdout.as_str()), (true, "4 plans: bit for bit the same\n"));
     lab.stop_planner().await;
@@ -124,17 +131,17 @@ async fn a_search_until_its_deadline_comes_back() {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_first_difference_is_shown() {
     let (mut lab, file) = recorded("reach", "cpn").await;
-    let plans = plans::read(&file).unwrap();
-    let mut exchanges = plans.exchanges().to_vec();
+    let recorded = trial::read(&file).unwrap();
+    let mut exchanges = recorded.exchanges().to_vec();
     let value = &mut exchanges[2].response.actions[1][3];
     let now = *value;
     *value = f32::from_bits(value.to_bits() ^ 1);
-    let recorded = *value;
+    let before = *value;
     exchanges[3].response.actions[0][0] = 0.5;
-    let spoiled = Plans::new(plans.episode().clone(), exchanges).unwrap();
-    std::fs::write(&file, plans::to_bytes(&spoiled).unwrap()).unwrap();
+    let spoiled = with_exchanges(&recorded, exchanges);
+    std::fs::write(&file, trial::to_bytes(&spoiled).unwrap()).unwrap();
     let ended = lab.replay(&file).await;
-    let expected = format!("step 2 of 4: actions[1][3]: recorded {recorded}, now {now}\n");
+    let expected = format!("step 2 of 4: actions[1][3]: recorded {before}, now {now}\n");
     assert_eq!((ended.success, ended.stdout), (false, expected));
     lab.stop_planner().await;
 }
@@ -142,7 +149,7 @@ async fn the_first_difference_is_shown() {
 #[tokio::test(flavor = "multi_thread")]
 async fn another_checkpoint_and_spoiled_files_are_refused() {
     let (mut lab, file) = recorded("reach", "cpn").await;
-    let digest = plans::read(&file).unwrap().episode().model_digest.clone();
+    let digest = trial::read(&file).unwrap().trial().model_digest.clone();
     let mut other = Lab::start(1).await;
     let ended = other.replay(&file).await;
     assert!(!ended.success && ended.stdout.is_empty());

@@ -3,6 +3,11 @@
 #![expect(clippy::unwrap_used, reason = "a test")]
 
 use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Planning, Run, StageTimes, Trial};
+use recording::trial::{Frame, Recording};
+use std::time::Duration;
+use wire::Image;
+use wire::sim::Variation;
+use wire::trial::RecordedTrial;
 
 /// Seeds below are those of demonstrations.
 const FIRST_SEED: u64 = 1_000_000;
@@ -133,6 +138,44 @@ fn what_was_solved_at_reset_is_counted_apart() {
     assert_eq!(summary.seeds["door-lock"].iter().collect::<Vec<_>>(), [&1_000_010, &1_000_011, &1_000_013, &1_000_014]);
     folder.write_run(&Run { trials: 3, ..run() }).unwrap();
     assert_ne!(evaluator::report(root.path()).unwrap().seeds_digest, summary.seeds_digest);
+}
+
+/// Filmstrips come from the recordings of the first success and failure; where none can be read, the report does without.
+#[test]
+fn filmstrips_are_frames_of_the_recordings() {
+    let (root, folder) = folder();
+    let pictures = || {
+        evaluator::report(root.path()).unwrap();
+        let html = std::fs::read_to_string(folder.path("report.html")).unwrap();
+        let last_frames = [40, 50, 150].map(|steps| html.contains(&format!("alt=\"After {steps} steps\"")));
+        (html.matches("data:image/png;base64,").count(), last_frames)
+    };
+    assert_eq!(pictures(), (0, [false; 3]));
+
+    for (seed, steps) in [(10, 40), (11, 50), (14, 150)] {
+        folder.write_recording(&recording(seed, steps)).unwrap();
+    }
+    assert_eq!(pictures(), (2 * 9, [true, false, true]));
+
+    std::fs::write(folder.path("trials/door-lock/cpn/1000010.mcap"), "of another version").unwrap();
+    assert_eq!(pictures(), (9, [false, false, true]));
+}
+
+/// Recording of a trial of door-lock.
+fn recording(seed: u64, steps: u32) -> Recording {
+    let image = |shade: u32| Image::new(2, 2, vec![shade as u8; 12]).unwrap();
+    let model = &run().models[0];
+    let trial = RecordedTrial {
+        variation: Variation { task: "door-lock".into(), seed: FIRST_SEED + seed },
+        model: model.name.clone(),
+        model_digest: model.digest.clone(),
+        goal: image(255),
+        goal_position: None,
+        steps,
+        plans: 0,
+    };
+    let frame = |step| Frame { image: image(step), time: Duration::from_millis(step.into()) };
+    Recording::new(trial, (0..=steps).map(frame).collect(), Vec::new()).unwrap()
 }
 
 /// Records from before plans could be set and progress was measured are of the default, and stay as they were.

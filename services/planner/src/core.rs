@@ -4,7 +4,6 @@ use crate::config::Config;
 use crate::goals::Goals;
 use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
-use crate::outbox::Outbox;
 use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
 use crate::task::{Answer, PlanTask};
@@ -92,11 +91,6 @@ impl PlannerCore {
             Ok(task) => self.thread.plan_then(task, reply),
             Err(error) => self.thread.outbox().put(move || reply(Err(error))),
         }
-    }
-
-    /// Outbox for replies that may block.
-    pub(crate) fn outbox(&self) -> Outbox {
-        self.thread.outbox()
     }
 
     /// Resolves the names in a request and checks its images.

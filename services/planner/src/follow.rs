@@ -1,18 +1,23 @@
 //! Follower of a trainer's announcements: verifies the signature, fetches the checkpoint, checks it, and swaps it in.
 
 use crate::core::PlannerCore;
-use backon::{ConstantBuilder, Retryable};
+use service_kit::network::{self, Retry};
 use std::collections::HashMap;
 use std::time::Duration;
 use wire::checkpoint::{
     CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse, CheckpointManifest, MAX_CHUNK_BYTES,
 };
-use wire::{Code, Error, key, query};
+use wire::{Code, Error, key};
 use zenoh::Session;
-use zenoh::key_expr::OwnedKeyExpr;
 
 /// Timeout of the answer with one chunk of a checkpoint.
 const CHUNK_TIMEOUT: Duration = Duration::from_secs(5);
+/// Retries of chunk requests: right after a reconnect a query can end without an answer, and many planners may ask at once.
+const RETRY: Retry = Retry {
+    delays: [Duration::from_millis(200); 2],
+    patience: Duration::from_secs(1),
+    when: |error| matches!(error.code, Code::Unavailable | Code::ResourceExhausted),
+};
 
 /// Follower of checkpoint announcements, which serves them one after the other.
 #[derive(Debug)]
@@ -69,29 +74,12 @@ async fn fetch(session: &Session, manifest: &CheckpointManifest) -> Result<Vec<u
         let length_bytes = u32::try_from(size - bytes.len()).unwrap_or(u32::MAX).min(MAX_CHUNK_BYTES);
         let offset_bytes = bytes.len() as u64;
         let request = CheckpointChunkRequest { digest: digest.clone(), offset_bytes, length_bytes };
-        let chunk = fetch_chunk(session, &key, &request).await?;
+        let CheckpointChunkResponse { data: chunk } =
+            network::ask(session, &key, request, CHUNK_TIMEOUT, RETRY).await?;
         if chunk.len() != length_bytes as usize {
             return Err(Error::invalid("data", format!("{length_bytes} bytes"), format!("{} bytes", chunk.len())));
         }
         bytes.extend(chunk);
     }
     Ok(bytes)
-}
-
-/// Retry policy of chunk requests: right after a reconnect a query can end without an answer, and many planners may ask at once.
-fn retry_policy() -> ConstantBuilder {
-    ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(4)
-}
-
-async fn fetch_chunk(
-    session: &Session,
-    key: &OwnedKeyExpr,
-    request: &CheckpointChunkRequest,
-) -> Result<Vec<u8>, Error> {
-    let ask = || query::call(session, key, request.clone(), CHUNK_TIMEOUT);
-    let answer: CheckpointChunkResponse = ask
-        .retry(retry_policy())
-        .when(|error: &Error| matches!(error.code, Code::Unavailable | Code::ResourceExhausted))
-        .await?;
-    Ok(answer.data)
 }

@@ -5,7 +5,6 @@
 //! watches training runs ([`runs`]); a run ([`training`]) reads the episodes and writes a checkpoint.
 
 pub mod publish;
-mod queries;
 pub mod record;
 pub mod runs;
 pub mod service;

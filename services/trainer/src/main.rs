@@ -12,7 +12,7 @@ use comfy_table::{LineStyle, Table, presets};
 use cpn::Preset;
 use serde::Deserialize;
 use serde::de::{IntoDeserializer, value};
-use service_kit::session::SessionConfig;
+use service_kit::session::{IntoAnyhow, SessionConfig};
 use service_kit::{config, output, session, shutdown, telemetry};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -78,10 +78,10 @@ async fn gather(config: &Config, count: usize, network: &SessionConfig) -> anyho
     let session = session::open(network).await?;
 
     let enough = tokio::select! {
-        done = mirror::follow(&session, &recordings, count) => done.map(|()| true).map_err(|e| anyhow!(e))?,
+        done = mirror::follow(&session, &recordings, count) => done.map(|()| true)?,
         signal = shutdown::requested() => signal.map(|()| false)?,
     };
-    session.close().await.map_err(|e| anyhow!(e))?;
+    session.close().await.into_anyhow()?;
     tracing::info!(kept = recordings.count(), of = count, "demonstrations from the network");
     Ok(enough)
 }
@@ -158,12 +158,12 @@ async fn runs(RunsArgs { json, trainer: TrainerArgs { trainer, session } }: Runs
         }
         output::print_line(table)?;
     }
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }
 
 /// Prints the state of a run; a failed run is an error.
 async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
-    session.close().await.map_err(|e| anyhow!(e))?;
+    session.close().await.into_anyhow()?;
     if let RunState::Failed { reason } = &run.state {
         bail!("{} failed: {reason}", run.name);
     }
@@ -173,7 +173,7 @@ async fn tell(session: Session, run: &Run) -> anyhow::Result<()> {
 async fn replay(ReplayArgs { dataset, tasks, session }: ReplayArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
     send::run(&session, &dataset, &tasks).await?;
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }
 
 async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Result<()> {
@@ -187,10 +187,10 @@ async fn mirror(MirrorArgs { dataset, once, session }: MirrorArgs) -> anyhow::Re
         }
     };
     tokio::select! {
-        done = work => done.map_err(|e| anyhow!(e))?,
+        done = work => done?,
         signal = shutdown::requested() => signal?,
     }
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }
 
 fn verify(VerifyArgs { dataset, tasks, episodes, json }: &VerifyArgs) -> anyhow::Result<()> {
@@ -212,19 +212,19 @@ async fn versions(VersionsArgs { model, json, session }: VersionsArgs) -> anyhow
     } else {
         output::print_line(publish::table(&versions))?;
     }
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }
 
 async fn promote(PromoteArgs { model, version, session }: PromoteArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
     let promoted = publish::promote(&session, model, version).await?;
     output::print_line(format_args!("{} {} is promoted", promoted.model, promoted.version))?;
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }
 
 async fn rollback(RollbackArgs { model, session }: RollbackArgs) -> anyhow::Result<()> {
     let session = session::open(&session).await?;
     let promoted = publish::roll_back(&session, model).await?;
     output::print_line(format_args!("{} {} is promoted", promoted.model, promoted.version))?;
-    session.close().await.map_err(|e| anyhow!(e))
+    session.close().await.into_anyhow()
 }

@@ -7,11 +7,11 @@ use crate::record::ingest::{Ingest, Limits};
 use crate::record::{self, Recorder};
 use crate::runs::zenoh::RunsZenoh;
 use crate::runs::{self, Runs};
-use anyhow::anyhow;
 use serde::{Deserialize, Serialize};
 use service_kit::access::Access;
 use service_kit::changes::Changes;
-use service_kit::session::Connection;
+use service_kit::network;
+use service_kit::session::{Connection, IntoAnyhow};
 use service_kit::{GrpcServer, SessionConfig, config, metrics, session};
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
@@ -25,6 +25,9 @@ use zenoh::liveliness::LivelinessToken;
 /// Timeout of requests in flight at shutdown, after training runs have saved their states; the rest of it then takes less than
 /// ten seconds.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(7);
+
+/// Maximum number of concurrent queries of each kind; each holds at most one episode in memory.
+pub(crate) const PLACES: usize = 16;
 
 /// State-changing requests of a trainer.
 pub(crate) const CHANGES: Changes = Changes {
@@ -128,12 +131,12 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
     // Before the session, so that health reports a missing connection.
     let mut grpc = runs::grpc::start(runs.clone(), listen, access).await?;
     let session = session::open(network).await?;
-    session::claim(&session, network, &token).await?;
+    let claimed = network::claim(&session, network, token).await?;
     let connection = Connection::follow(&session, network);
     grpc.follow(connection.connected());
 
     let ingest = Arc::new(Ingest::new(Arc::clone(&recordings), Limits::default()));
-    let recorder = record::start(&session, recordings, ingest).await.map_err(|e| anyhow!(e))?;
+    let recorder = record::start(&session, recordings, ingest).await?;
     let runs_zenoh = runs::zenoh::start(&session, &name, &runs).await?;
     let mut publisher = publish::start(&session, &versions).await?;
     let measured = runs.clone();
@@ -142,7 +145,7 @@ pub async fn start(config: Config) -> anyhow::Result<Service> {
         Ok(())
     });
 
-    let alive = session.liveliness().declare_token(token).await.map_err(|e| anyhow!(e))?;
+    let alive = claimed.alive().await?;
     grpc.ready().await;
     info!(name, grpc = %grpc.address, "trainer is ready");
     Ok(Service { session, recorder, runs, runs_zenoh, grpc, publisher, connection, alive })
@@ -181,7 +184,7 @@ impl Service {
         let drained = tokio::time::timeout(DRAIN_TIMEOUT, self.grpc.drain()).await;
         drop(self.runs_zenoh);
         self.publisher.tasks.shutdown().await;
-        self.session.close().await.map_err(|e| anyhow!(e))?;
+        self.session.close().await.into_anyhow()?;
         drained.unwrap_or(Ok(()))
     }
 }

@@ -6,9 +6,9 @@ use std::time::Duration;
 use wire::checkpoint::*;
 use wire::demonstration::*;
 use wire::planner::*;
-use wire::replay::*;
 use wire::sim::*;
 use wire::training::*;
+use wire::trial::*;
 use wire::{Error, Image, Message, Position, encode};
 
 /// Check of a message type, and the bytes of a message.
@@ -65,11 +65,13 @@ fn planner() -> Vec<Example> {
         example(UnloadModelResponse),
         example(ListModelsRequest),
         example(ListModelsResponse { models: vec![model; 2] }),
-        example(PlannedEpisode {
+        example(RecordedTrial {
             variation: variation(),
             model: "cpn".into(),
             model_digest: digest(),
-            goal: image().into(),
+            goal: image(),
+            goal_position: Some(position()),
+            steps: 3,
             plans: 2,
         }),
     ]

@@ -2,11 +2,10 @@
 //! promotes and rolls back versions.
 
 use crate::publish::versions::Versions;
-use crate::queries;
-use crate::service::CHANGES;
-use anyhow::anyhow;
-use backon::{ConstantBuilder, Retryable};
+use crate::service::{CHANGES, PLACES};
 use comfy_table::{CellAlignment, LineStyle, Table, presets};
+use service_kit::network::{self, Places, Retry, Server};
+use service_kit::session::IntoAnyhow;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Notify;
@@ -16,21 +15,27 @@ use wire::checkpoint::{
     CheckpointManifest, CheckpointVersion, ListVersionsRequest, ListVersionsResponse, PromoteVersionRequest,
     PromoteVersionResponse, RollBackRequest, RollBackResponse,
 };
-use wire::{Code, Error, Message, encode, key, query};
+use wire::{Code, Error, Message, encode, key};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
-use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 
 /// Polling interval of the folder of checkpoints.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Timeout of an answer.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// Retries while there is no trainer, since the session may be new. A request that may have arrived is not repeated: rolling back
+/// is not idempotent.
+const RETRY: Retry = Retry {
+    delays: [Duration::from_millis(200); 2],
+    patience: Duration::from_secs(5),
+    when: |error| error.code == Code::Unavailable,
+};
 
 /// Queryables and announcements of the versions, which end when this is dropped.
 #[derive(Debug)]
 pub(crate) struct Publisher {
-    _queryables: [Queryable<()>; 4],
+    _server: Server<Versions>,
     /// Tasks that end only with an error.
     pub(crate) tasks: JoinSet<anyhow::Result<()>>,
 }
@@ -41,40 +46,19 @@ pub(crate) struct Publisher {
 /// # Errors
 /// If zenoh refuses a declaration.
 pub(crate) async fn start(session: &Session, versions: &Arc<Versions>) -> anyhow::Result<Publisher> {
-    let queryables = [
-        serve(session, key::checkpoint_chunk("*")?, None, versions, Versions::chunk).await?,
-        serve(session, key::checkpoint_list_versions("*")?, None, versions, Versions::list).await?,
-        serve(session, key::checkpoint_promote("*")?, Some("promote"), versions, Versions::promote).await?,
-        serve(session, key::checkpoint_roll_back("*")?, Some("roll_back"), versions, Versions::roll_back).await?,
-    ];
+    let mut server = Server::new(session, Arc::clone(versions));
+    let places = || Places::new(PLACES);
+    server.serve(key::checkpoint_chunk("*")?, &places(), Versions::chunk).await?;
+    server.serve(key::checkpoint_list_versions("*")?, &places(), Versions::list).await?;
+    let promote = key::checkpoint_promote("*")?;
+    server.serve_change(promote, &places(), (CHANGES, "promote"), Versions::promote).await?;
+    let roll_back = key::checkpoint_roll_back("*")?;
+    server.serve_change(roll_back, &places(), (CHANGES, "roll_back"), Versions::roll_back).await?;
 
     let mut tasks = JoinSet::new();
     tasks.spawn(announce(session.clone(), Arc::clone(versions)));
     tasks.spawn(take_in(Arc::clone(versions)));
-    Ok(Publisher { _queryables: queryables, tasks })
-}
-
-/// Declares a queryable, of a state `change` if there is one.
-async fn serve<Q, R>(
-    session: &Session,
-    key: OwnedKeyExpr,
-    change: Option<&'static str>,
-    versions: &Arc<Versions>,
-    answer: fn(&Versions, Q) -> Result<R, Error>,
-) -> anyhow::Result<Queryable<()>>
-where
-    Q: Message + 'static,
-    R: Message + 'static,
-{
-    let versions = Arc::clone(versions);
-    let answer = move |query: &Query| {
-        let result = query::request(query).and_then(|request| answer(&versions, request));
-        if let (Some(change), Err(error)) = (change, &result) {
-            CHANGES.refused(change, query.key_expr(), error);
-        }
-        query::reply(query, result)
-    };
-    queries::serve(session, key, true, answer).await.map_err(|e| anyhow!(e))
+    Ok(Publisher { _server: server, tasks })
 }
 
 /// Announces all promoted versions whenever one changes or a planner appears; planners ignore repeated announcements.
@@ -87,7 +71,7 @@ async fn announce(session: Session, versions: Arc<Versions>) -> anyhow::Result<(
         }
     };
     let planners = session.liveliness().declare_subscriber(key::planner_alive("*")?).history(true);
-    let _planners = planners.callback(on_token).await.map_err(|e| anyhow!(e))?;
+    let _planners = planners.callback(on_token).await.into_anyhow()?;
 
     let mut promoted = versions.promoted();
     loop {
@@ -96,7 +80,7 @@ async fn announce(session: Session, versions: Arc<Versions>) -> anyhow::Result<(
             let CheckpointManifest { model, version, digest, .. } = &announcement.manifest;
             debug!(model, version, digest, "announced");
             let key = key::checkpoint_announcement(model)?;
-            session.put(key, encode(announcement)).await.map_err(|e| anyhow!(e))?;
+            session.put(key, encode(announcement)).await.into_anyhow()?;
         }
         tokio::select! {
             changed = promoted.changed() => changed?,
@@ -148,12 +132,9 @@ pub async fn roll_back(session: &Session, model: String) -> Result<CheckpointMan
     Ok(response.manifest)
 }
 
-/// Calls a trainer, with retries for five seconds while there is none, since the session may be new. A request that may have
-/// arrived is not repeated: rolling back is not idempotent.
+/// Calls a trainer.
 async fn call<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyExpr, request: Q) -> Result<R, Error> {
-    let retries = ConstantBuilder::default().with_delay(Duration::from_millis(200)).with_max_times(25);
-    let ask = || query::call(session, key, request.clone(), TIMEOUT);
-    ask.retry(retries).when(|error: &Error| error.code == Code::Unavailable).await
+    network::ask(session, key, request, TIMEOUT, RETRY).await
 }
 
 /// Table of versions for a terminal, with abbreviated digests.

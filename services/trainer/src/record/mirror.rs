@@ -1,9 +1,9 @@
 //! Mirror of other recorders: fetches their episodes, then follows their announcements, for ever or up to a number of episodes.
 
 use crate::record::folder::Recordings;
-use crate::record::send::{is_transient, retry_policy};
-use backon::Retryable;
+use crate::record::send::RETRY;
 use recording::Episode;
+use service_kit::session::IntoAnyhow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -34,16 +34,17 @@ pub async fn once(session: &Session, recordings: &Arc<Recordings>) -> Result<(),
             _ => Ok(()),
         }
     };
-    attempt.retry(retry_policy()).when(is_transient).await
+    RETRY.run(attempt).await
 }
 
 /// Fetches all episodes that `recordings` lacks, and then each announced one, until `enough` are stored.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
-pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usize) -> zenoh::Result<()> {
+pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usize) -> anyhow::Result<()> {
     let announcements =
-        session.declare_subscriber(key::demonstration_recorded("*")?).with(RingChannel::new(ANNOUNCEMENTS)).await?;
+        session.declare_subscriber(key::demonstration_recorded("*")?).with(RingChannel::new(ANNOUNCEMENTS));
+    let announcements = announcements.await.into_anyhow()?;
     while recordings.count() < enough {
         match pass(session, recordings).await {
             Ok(Pass { offered, fetched }) if fetched > 0 => info!(offered, fetched, "mirrored"),
@@ -55,7 +56,7 @@ pub async fn follow(session: &Session, recordings: &Arc<Recordings>, enough: usi
         while recordings.count() < enough
             && let Ok(announcement) = tokio::time::timeout_at(next_pass, announcements.recv_async()).await
         {
-            let episode = wire::decode(&announcement?.payload().to_bytes());
+            let episode = wire::decode(&announcement.into_anyhow()?.payload().to_bytes());
             let taken = async { take(session, recordings, episode?).await };
             if let Err(error) = taken.await {
                 warn!(%error, "not mirrored; tried again");

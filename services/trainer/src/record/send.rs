@@ -2,8 +2,8 @@
 
 use crate::record::folder;
 use anyhow::{Context, bail, ensure};
-use backon::{ExponentialBuilder, Retryable};
 use recording::Episode;
+use service_kit::network::{Retry, is_outage};
 use std::path::Path;
 use std::time::Duration;
 use tracing::info;
@@ -14,6 +14,12 @@ use zenoh::qos::CongestionControl;
 
 /// Timeout of the answer to a commit.
 const COMMIT_TIMEOUT: Duration = Duration::from_secs(10);
+/// Retries for two minutes: the recorder may be starting, or busy with other episodes.
+pub(crate) const RETRY: Retry = Retry {
+    delays: [Duration::from_millis(20), Duration::from_secs(1)],
+    patience: Duration::from_secs(120),
+    when: is_outage,
+};
 
 /// Sends all recordings of `folder`, or those of some tasks, until a recorder has stored them.
 ///
@@ -68,7 +74,7 @@ pub async fn send(session: &Session, episode: &Episode) -> Result<(), Error> {
             }
         }
     };
-    round.retry(retry_policy()).when(is_transient).await
+    RETRY.run(round).await
 }
 
 async fn commit(session: &Session, episode: &Episode) -> Result<Vec<u32>, Error> {
@@ -76,18 +82,4 @@ async fn commit(session: &Session, episode: &Episode) -> Result<Vec<u32>, Error>
     let request = CommitEpisodeRequest { episode: episode.info().clone() };
     let response: CommitEpisodeResponse = query::call(session, &key, request, COMMIT_TIMEOUT).await?;
     Ok(response.missing_steps)
-}
-
-/// Whether an error is transient.
-pub(crate) fn is_transient(error: &Error) -> bool {
-    matches!(error.code, Code::Unavailable | Code::DeadlineExceeded | Code::ResourceExhausted)
-}
-
-/// Retry policy, for about two minutes: the recorder may be starting, or busy with other episodes.
-pub(crate) fn retry_policy() -> ExponentialBuilder {
-    ExponentialBuilder::default()
-        .with_min_delay(Duration::from_millis(20))
-        .with_max_delay(Duration::from_secs(1))
-        .with_max_times(125)
-        .with_jitter()
 }

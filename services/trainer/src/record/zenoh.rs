@@ -1,98 +1,110 @@
 //! Zenoh transport of the recorder: receives streams, lists stored episodes, and serves their steps.
 
-use crate::queries::serve;
 use crate::record::folder::Recordings;
 use crate::record::ingest::{Commit, Ingest};
+use crate::service::PLACES;
+use service_kit::network::{Places, Server};
+use service_kit::session::IntoAnyhow;
 use std::sync::Arc;
 use tracing::warn;
 use wire::demonstration::{CommitEpisodeRequest, CommitEpisodeResponse};
 use wire::{Error, encode, key, query};
 use zenoh::pubsub::Subscriber;
-use zenoh::query::{Query, Queryable};
+use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
 /// Subscriber and queryables of a recorder, undeclared when dropped.
 #[derive(Debug)]
 pub struct Recorder {
     _steps: Subscriber<()>,
-    _queryables: [Queryable<()>; 3],
+    _server: Server<Parts>,
 }
 
 /// Starts a recorder, which stores streamed episodes and offers stored ones.
 ///
 /// # Errors
 /// If zenoh refuses a declaration.
-pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<Ingest>) -> zenoh::Result<Recorder> {
-    let (listed, read) = (Arc::clone(&recordings), recordings);
-    let list = serve(session, key::demonstration_recorded("*")?, false, move |query| list(&listed, query)).await?;
-    let send = serve(session, key::demonstration_step("*", "*")?, false, move |query| send(&read, query)).await?;
+pub async fn start(session: &Session, recordings: Arc<Recordings>, ingest: Arc<Ingest>) -> anyhow::Result<Recorder> {
+    let parts = Parts { session: session.clone(), recordings, ingest: Arc::clone(&ingest) };
+    let mut server = Server::new(session, parts);
+    server.serve_many(key::demonstration_recorded("*")?, &Places::new(PLACES), Parts::list).await?;
+    server.serve_many(key::demonstration_step("*", "*")?, &Places::new(PLACES), Parts::send).await?;
 
-    let receiver = Arc::clone(&ingest);
     // In the callback, which only copies a frame, so that steps are ingested before the commit that follows them.
     let steps = session
         .declare_subscriber(key::demonstration_step("*", "*")?)
         .callback(move |sample| match wire::decode(&sample.payload().to_bytes()) {
-            Ok(step) => receiver.step(step),
+            Ok(step) => ingest.step(step),
             Err(error) => warn!(key = %sample.key_expr(), %error, "step refused"),
         })
-        .await?;
+        .await
+        .into_anyhow()?;
 
-    let announcer = session.clone();
-    let commit =
-        serve(session, key::demonstration_commit("*")?, false, move |query| commit(&announcer, &ingest, query)).await?;
-    Ok(Recorder { _steps: steps, _queryables: [list, send, commit] })
+    server.serve_many(key::demonstration_commit("*")?, &Places::new(PLACES), Parts::commit).await?;
+    Ok(Recorder { _steps: steps, _server: server })
 }
 
-fn commit(session: &Session, ingest: &Ingest, query: &Query) -> zenoh::Result<()> {
-    let request: Result<CommitEpisodeRequest, Error> = query::request(query);
-    let commit = request.and_then(|request| Ok((ingest.commit(&request)?, request)));
-    let missing_steps = match commit {
-        Ok((Commit::Missing(steps), _)) => steps,
-        Ok((Commit::KeptBefore, _)) => Vec::new(),
-        Ok((Commit::Kept, CommitEpisodeRequest { episode })) => {
-            session.put(key::demonstration_recorded(&episode.episode_id)?, encode(episode)).wait()?;
-            Vec::new()
-        }
-        Err(error) => {
-            warn!(key = %query.key_expr(), %error, "commit refused");
-            return query::refuse(query, error);
-        }
-    };
-    query::reply(query, Ok(CommitEpisodeResponse { missing_steps }))
+/// State of the queryables.
+#[derive(Debug)]
+struct Parts {
+    session: Session,
+    recordings: Arc<Recordings>,
+    ingest: Arc<Ingest>,
 }
 
-/// Answers a query with the metadata of all matching stored episodes.
-fn list(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
-    let asked = query.key_expr();
-    let episodes = match key::episode_of_demonstration_recorded(asked).filter(|episode| !episode.contains('*')) {
-        Some(episode_id) => recordings.get(&episode_id).into_iter().collect(),
-        None => recordings.all(),
-    };
-    for episode in episodes {
-        let key = key::demonstration_recorded(&episode.episode_id)?;
-        if asked.intersects(&key) {
-            query::reply_at(query, &key, episode)?;
-        }
+impl Parts {
+    fn commit(&self, query: &Query) -> zenoh::Result<()> {
+        let request: Result<CommitEpisodeRequest, Error> = query::request(query);
+        let commit = request.and_then(|request| Ok((self.ingest.commit(&request)?, request)));
+        let missing_steps = match commit {
+            Ok((Commit::Missing(steps), _)) => steps,
+            Ok((Commit::KeptBefore, _)) => Vec::new(),
+            Ok((Commit::Kept, CommitEpisodeRequest { episode })) => {
+                self.session.put(key::demonstration_recorded(&episode.episode_id)?, encode(episode)).wait()?;
+                Vec::new()
+            }
+            Err(error) => {
+                warn!(key = %query.key_expr(), %error, "commit refused");
+                return query::refuse(query, error);
+            }
+        };
+        query::reply(query, Ok(CommitEpisodeResponse { missing_steps }))
     }
-    Ok(())
-}
 
-/// Answers a query with the matching steps of one stored episode.
-fn send(recordings: &Recordings, query: &Query) -> zenoh::Result<()> {
-    let asked = query.key_expr();
-    let Some(episode_id) = key::episode_of_demonstration_step(asked).filter(|episode| !episode.contains('*')) else {
-        return query::refuse(query, Error::invalid("key", "the steps of one episode", asked));
-    };
-    let episode = match recordings.read(&episode_id) {
-        Ok(episode) => episode,
-        Err(error) => return query::refuse(query, error),
-    };
-    // An unknown episode gets no answer, since another recorder may have it.
-    for step in episode.into_iter().flat_map(recording::Episode::into_steps) {
-        let key = key::demonstration_step(&episode_id, &step.step.to_string())?;
-        if asked.intersects(&key) {
-            query::reply_at(query, &key, step)?;
+    /// Answers a query with the metadata of all matching stored episodes.
+    fn list(&self, query: &Query) -> zenoh::Result<()> {
+        let asked = query.key_expr();
+        let episodes = match key::episode_of_demonstration_recorded(asked).filter(|episode| !episode.contains('*')) {
+            Some(episode_id) => self.recordings.get(&episode_id).into_iter().collect(),
+            None => self.recordings.all(),
+        };
+        for episode in episodes {
+            let key = key::demonstration_recorded(&episode.episode_id)?;
+            if asked.intersects(&key) {
+                query::reply_at(query, &key, episode)?;
+            }
         }
+        Ok(())
     }
-    Ok(())
+
+    /// Answers a query with the matching steps of one stored episode.
+    fn send(&self, query: &Query) -> zenoh::Result<()> {
+        let asked = query.key_expr();
+        let Some(episode_id) = key::episode_of_demonstration_step(asked).filter(|episode| !episode.contains('*'))
+        else {
+            return query::refuse(query, Error::invalid("key", "the steps of one episode", asked));
+        };
+        let episode = match self.recordings.read(&episode_id) {
+            Ok(episode) => episode,
+            Err(error) => return query::refuse(query, error),
+        };
+        // An unknown episode gets no answer, since another recorder may have it.
+        for step in episode.into_iter().flat_map(recording::Episode::into_steps) {
+            let key = key::demonstration_step(&episode_id, &step.step.to_string())?;
+            if asked.intersects(&key) {
+                query::reply_at(query, &key, step)?;
+            }
+        }
+        Ok(())
+    }
 }

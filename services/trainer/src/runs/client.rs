@@ -1,20 +1,27 @@
 //! Client of the service's training runs, with a progress bar for terminals.
 
 use crate::training::progress::{Bar, Observer};
-use anyhow::{Context, anyhow};
-use backon::{ConstantBuilder, Retryable};
+use anyhow::Context;
+use service_kit::network::{self, Retry};
+use service_kit::session::IntoAnyhow;
 use std::time::Duration;
 use wire::training::{
     ListRunsRequest, ListRunsResponse, Run, RunState, StartRunRequest, StartRunResponse, StopRunRequest,
     StopRunResponse,
 };
-use wire::{Code, Error, Message, key, query};
+use wire::{Code, Error, Message, key};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
 use zenoh::key_expr::OwnedKeyExpr;
 
 /// Timeout of an answer; a run may take half a minute to stop.
 const TIMEOUT: Duration = Duration::from_secs(60);
+/// Retries while the trainer is unavailable: it may not be discovered yet.
+const RETRY: Retry = Retry {
+    delays: [Duration::from_millis(500); 2],
+    patience: Duration::from_secs(2),
+    when: |error| error.code == Code::Unavailable,
+};
 /// Time without a publication after which a run's state is queried.
 const SILENCE: Duration = Duration::from_secs(5);
 
@@ -53,7 +60,7 @@ pub async fn list(session: &Session, trainer: &str) -> Result<Vec<Run>, Error> {
 pub async fn watch(session: &Session, trainer: &str, name: &str) -> anyhow::Result<Run> {
     // Subscribed before the first query, so that no change in between is missed. Only the latest publication matters.
     let published = session.declare_subscriber(key::training_progress(name)?).with(RingChannel::new(1));
-    let published = published.await.map_err(|e| anyhow!(e))?;
+    let published = published.await.into_anyhow()?;
 
     let mut run = get(session, trainer, name).await?;
     let mut bar = Bar::new(name);
@@ -66,7 +73,7 @@ pub async fn watch(session: &Session, trainer: &str, name: &str) -> anyhow::Resu
             return Ok(run);
         }
         run = match tokio::time::timeout(SILENCE, published.recv_async()).await {
-            Ok(sample) => wire::decode(&sample.map_err(|e| anyhow!(e))?.payload().to_bytes())?,
+            Ok(sample) => wire::decode(&sample.into_anyhow()?.payload().to_bytes())?,
             // The step is slow, or the trainer is gone.
             Err(_) => get(session, trainer, name).await?,
         };
@@ -81,9 +88,6 @@ async fn get(session: &Session, trainer: &str, name: &str) -> anyhow::Result<Run
     Ok(runs.swap_remove(index))
 }
 
-/// Calls a trainer, with retries while it is unavailable: it may not be discovered yet.
 async fn ask<Q: Message + Clone, R: Message>(session: &Session, key: &OwnedKeyExpr, request: Q) -> Result<R, Error> {
-    let retries = ConstantBuilder::default().with_delay(Duration::from_millis(500)).with_max_times(4);
-    let ask = || query::call(session, key, request.clone(), TIMEOUT);
-    ask.retry(retries).when(|error: &Error| error.code == Code::Unavailable).await
+    network::ask(session, key, request, TIMEOUT, RETRY).await
 }

@@ -1,23 +1,22 @@
 //! Zenoh transport of training runs: queryables, and publication of progress.
 
-use crate::queries::serve;
 use crate::runs::Runs;
-use crate::service::CHANGES;
-use anyhow::{anyhow, ensure};
+use crate::service::{CHANGES, PLACES};
+use anyhow::ensure;
+use service_kit::network::{Places, Server};
 use tokio::runtime::Handle;
 use tokio_util::task::AbortOnDropHandle;
 use tracing::warn;
 use wire::training::{
     ListRunsRequest, ListRunsResponse, StartRunRequest, StartRunResponse, StopRunRequest, StopRunResponse,
 };
-use wire::{Error, encode, key, query};
+use wire::{encode, key, query};
 use zenoh::Session;
-use zenoh::query::{Query, Queryable};
 
 /// Queryables and publisher of training runs, undeclared when dropped.
 #[derive(Debug)]
 pub(crate) struct RunsZenoh {
-    _queryables: [Queryable<()>; 3],
+    _server: Server<Runs>,
     _publisher: AbortOnDropHandle<()>,
 }
 
@@ -28,42 +27,23 @@ pub(crate) struct RunsZenoh {
 pub(crate) async fn start(session: &Session, name: &str, runs: &Runs) -> anyhow::Result<RunsZenoh> {
     let key = key::trainer_start_run(name)?;
     ensure!(!key.is_wild(), "name: expected that of one trainer, got {name:?}");
-    let zenoh = |e: zenoh::Error| anyhow!(e);
-    let [start_key, stop_key, list_key] = [key, key::trainer_stop_run(name)?, key::trainer_list_runs(name)?];
+    let mut server = Server::new(session, runs.clone());
+    let places = || Places::new(PLACES);
 
-    let (core, own) = (runs.clone(), start_key.clone());
-    let start = move |query: &Query| {
-        let answer = query::request(query).and_then(|request: StartRunRequest| core.start(&request));
-        report_refusal("start_run", query, &answer);
-        query::reply_as(query, &own, answer.map(|run| StartRunResponse { run }))
-    };
-    let (core, own, runtime) = (runs.clone(), stop_key.clone(), Handle::current());
-    let stop = move |query: &Query| {
-        let stop = |request: StopRunRequest| runtime.block_on(core.stop(&request.name));
-        let answer = query::request(query).and_then(stop);
-        report_refusal("stop_run", query, &answer);
-        query::reply_as(query, &own, answer.map(|run| StopRunResponse { run }))
-    };
-    let (core, own) = (runs.clone(), list_key.clone());
-    let list = move |query: &Query| {
-        let answer = query::request(query).map(|_: ListRunsRequest| ListRunsResponse { runs: core.list() });
-        query::reply_as(query, &own, answer)
-    };
+    let start = |runs: &Runs, request: StartRunRequest| Ok(StartRunResponse { run: runs.start(&request)? });
+    server.serve_change(key, &places(), (CHANGES, "start_run"), start).await?;
 
-    let queryables = [
-        serve(session, start_key, false, start).await.map_err(zenoh)?,
-        serve(session, stop_key, false, stop).await.map_err(zenoh)?,
-        serve(session, list_key, false, list).await.map_err(zenoh)?,
-    ];
+    let stop = |runs: &Runs, request: StopRunRequest| {
+        let run = Handle::current().block_on(runs.stop(&request.name))?;
+        Ok(StopRunResponse { run })
+    };
+    server.serve_change(key::trainer_stop_run(name)?, &places(), (CHANGES, "stop_run"), stop).await?;
+
+    let list = |runs: &Runs, _: ListRunsRequest| Ok(ListRunsResponse { runs: runs.list() });
+    server.serve(key::trainer_list_runs(name)?, &places(), list).await?;
+
     let publisher = AbortOnDropHandle::new(tokio::spawn(publish(session.clone(), runs.clone())));
-    Ok(RunsZenoh { _queryables: queryables, _publisher: publisher })
-}
-
-/// Logs and counts a refused change.
-fn report_refusal<R>(change: &'static str, query: &Query, answer: &Result<R, Error>) {
-    if let Err(error) = answer {
-        CHANGES.refused(change, query.key_expr(), error);
-    }
+    Ok(RunsZenoh { _server: server, _publisher: publisher })
 }
 
 async fn publish(session: Session, runs: Runs) {
