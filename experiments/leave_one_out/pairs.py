@@ -62,11 +62,11 @@ def read_frames(recording: Path) -> tuple[Image.Image, list[Image.Image]]:
     goal, frames = None, []
     with recording.open("rb") as file:
         reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(topics=["/episode", "/plan/request"]):
+        for _, channel, _, message in reader.iter_decoded_messages(topics=["/episode", "/camera"]):
             if channel.topic == "/episode":
-                goal = _image(message.goal_image)
+                goal = _image(message.goal)
             else:
-                frames.append(_image(message.observation))
+                frames.append(_image(message))
     if goal is None or not frames:
         raise ValueError(f"{recording}: expected a goal picture and frames, got none")
     return goal, frames
