@@ -61,15 +61,16 @@ impl Agent {
     /// The outer loss of a batch with embedded frames, `[F, Z]`.
     pub fn embedded_loss(&self, embeddings: &Tensor, batch: &TensorBatch) -> Tensor {
         let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));
-        loss::behaviour_cloning(&self.plan_differentiably(&x, &x_g), &batch.actions, &batch.mask)
+        let planned = self.plan_differentiably(&x, &x_g, &batch.steps_left);
+        loss::behaviour_cloning(&planned, &batch.actions, &batch.mask)
     }
 
-    /// Planned actions, `[B, H, A]`, from x to x_g, both `[B, Z]`, with their graph.
-    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
+    /// Planned actions, `[B, H, A]`, from x to x_g, both `[B, Z]`, with their graph; `steps_left` is k, `[B]`.
+    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> Tensor {
         if self.config.method.plans() {
             self.inner_loop().plan_differentiably(x, x_g).actions
         } else {
-            self.react(x, x_g)
+            self.react(x, x_g, steps_left)
         }
     }
 
@@ -88,9 +89,14 @@ impl Agent {
         }
     }
 
-    /// The policy's action for x and x_g `[B, Z]`, as a plan of one step `[B, 1, A]`.
-    fn react(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
-        self.network.policy(&self.network.features(x, x_g)).unsqueeze(1)
+    /// The policy's action for x and x_g `[B, Z]`, and k `[B]` if the method takes it, as a plan of one step `[B, 1, A]`.
+    fn react(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> Tensor {
+        let features = if self.config.method.takes_steps_left() {
+            self.network.features(x, &Tensor::cat(&[x_g, &steps_left.unsqueeze(1)], 1))
+        } else {
+            self.network.features(x, x_g)
+        };
+        self.network.policy(&features).unsqueeze(1)
     }
 
     /// H, the planning horizon.
@@ -103,12 +109,12 @@ impl Agent {
         tch::no_grad(|| self.encoder.encode(input))
     }
 
-    /// Plans from x to x_g, both `[B, Z]`, without a graph: the reference for [`Planner`](cpn::Planner).
-    pub fn plan(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
+    /// Plans from x to x_g, both `[B, Z]`, without a graph: the reference for [`Planner`](cpn::Planner). `steps_left` is k, `[B]`.
+    pub fn plan(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> TensorPlan {
         if self.config.method.plans() {
             self.inner_loop().plan(x, x_g)
         } else {
-            TensorPlan { actions: tch::no_grad(|| self.react(x, x_g)), inner_losses: Vec::new() }
+            TensorPlan { actions: tch::no_grad(|| self.react(x, x_g, steps_left)), inner_losses: Vec::new() }
         }
     }
 }

@@ -21,9 +21,8 @@ impl PolicyDynamics {
         let ModelConfig { method, hidden, actions, .. } = *config;
         let latent = config.encoder.latent();
         let dense = |name: &str, inputs, outputs| Dense::new(&(path / name), inputs, outputs, config);
-        let context = if method.is_goal_conditioned() { latent } else { 0 };
         Self {
-            trunk: dense("trunk", latent + context, hidden),
+            trunk: dense("trunk", config.trunk_inputs(), hidden),
             policy: [dense("policy_0", hidden, hidden), dense("policy_1", hidden, actions)],
             dynamics: method
                 .plans()
@@ -32,7 +31,8 @@ impl PolicyDynamics {
         }
     }
 
-    /// The trunk: features `[B, hidden]` of a state x and a goal x_g, both `[B, Z]`.
+    /// The trunk: features `[B, hidden]` of a state x and a goal x_g, both `[B, Z]`; for a method that takes the number of steps left,
+    /// x_g has one more column.
     pub fn features(&self, x: &Tensor, x_g: &Tensor) -> Tensor {
         let input = if self.goal_conditioned { Tensor::cat(&[x, x_g], 1) } else { x.shallow_clone() };
         self.trunk.forward(&input).relu()

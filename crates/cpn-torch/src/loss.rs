@@ -13,6 +13,8 @@ pub struct TensorBatch {
     pub observations: Tensor,
     /// Index of each sample's goal among the frames, `[B]` integers.
     pub goals: Tensor,
+    /// k, the scaled number of steps left, `[B]`.
+    pub steps_left: Tensor,
     /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Tensor,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
@@ -28,6 +30,7 @@ impl TensorBatch {
             frames: on_device(tensors::from_frames(&batch.frames)),
             observations: on_device(tensors::from_indices(&batch.observations)),
             goals: on_device(tensors::from_indices(&batch.goals)),
+            steps_left: on_device(tensors::from_steps_left(batch.steps_left.iter().copied())),
             actions: on_device(Tensor::from_slice(&batch.actions).view([samples, horizon, -1])),
             mask: on_device(Tensor::from_slice(&batch.mask).view([samples, horizon])),
         }

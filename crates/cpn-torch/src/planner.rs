@@ -71,6 +71,10 @@ impl Method for TorchPlanner {
         self.config.encoder.input() == input
     }
 
+    fn takes_steps_left(&self) -> bool {
+        self.config.method.takes_steps_left()
+    }
+
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         let block = &self.searcher.blocks_mut()[0];
         inputs.chunks(block.capacity).flat_map(|inputs| block.encode(inputs)).collect()
@@ -163,7 +167,8 @@ impl PlanBlock for TorchBlock {
         let x = self.stacked(queries.iter().map(|query| query.x), rows);
         let x_g = self.stacked(queries.iter().map(|query| query.x_g), rows);
         if purpose == Purpose::Actions {
-            self.actions = tensors::to_floats(&self.agent.plan(&x, &x_g).actions);
+            let steps_left = self.padded(&tensors::from_steps_left(queries.iter().map(|query| query.steps_left)));
+            self.actions = tensors::to_floats(&self.agent.plan(&x, &x_g, &steps_left).actions);
             return vec![0.0; rows];
         }
 

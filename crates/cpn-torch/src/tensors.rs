@@ -2,7 +2,7 @@
 
 use cpn::archive;
 use cpn::method::{Frames, Observed};
-use cpn::{images, positions};
+use cpn::{images, positions, steps_left};
 use tch::{Device, Kind, Tensor};
 
 /// Images as `[B, 84, 84, 3]` bytes.
@@ -60,6 +60,11 @@ fn position(input: &Observed<'_>) -> [f32; 3] {
 /// Indices as `[B]` integers.
 pub fn from_indices(indices: &[usize]) -> Tensor {
     Tensor::from_slice(&indices.iter().map(|index| *index as i64).collect::<Vec<_>>())
+}
+
+/// Numbers of steps left, scaled, as `[B]`.
+pub fn from_steps_left(steps: impl Iterator<Item = u32>) -> Tensor {
+    Tensor::from_slice(&steps.map(steps_left::scaled).collect::<Vec<_>>())
 }
 
 /// A tensor of an archive, with its element type.

@@ -35,7 +35,7 @@ fn check(method: &str) {
     assert_close("x", &x, &golden["x"]);
     assert_close("x_g", &x_g, &golden["x_g"]);
 
-    let plan = agent.plan(&x, &x_g);
+    let plan = agent.plan(&x, &x_g, &common::steps_left(x.size()[0]));
     assert_close("actions", &plan.actions, &golden["actions"]);
     assert_close("inner_losses", &Tensor::stack(&plan.inner_losses, 0), &golden["inner_losses"]);
 

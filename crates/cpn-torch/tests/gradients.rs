@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{new_agent, uniform};
+use common::{new_agent, steps_left, uniform};
 use cpn::config::ConvConfig;
 use cpn::engine::{EncoderPass, OuterLoop, Samples, Weights};
 use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, Precision};
@@ -35,13 +35,13 @@ fn check(config: ModelConfig, rows: i64, threads: usize) {
     let demonstrated = uniform(&[rows, config.horizon, config.actions], 3);
     let mask = uniform(&[rows, config.horizon], 4).gt(-0.6).to_kind(Kind::Double);
 
-    let planned = agent.plan_differentiably(&x, &x_g);
+    let planned = agent.plan_differentiably(&x, &x_g, &steps_left(rows));
     let reference = loss::behaviour_cloning(&planned, &demonstrated, &mask);
     reference.backward();
 
     let variables = Named(agent.variables().variables());
-    let (xs, x_gs, actions, masks) = (floats(&x), floats(&x_g), floats(&demonstrated), floats(&mask));
-    let samples = Samples { x: &xs, x_g: &x_gs, actions: &actions, mask: &masks };
+    let [xs, x_gs, ks, actions, masks] = [&x, &x_g, &steps_left(rows), &demonstrated, &mask].map(floats);
+    let samples = Samples { x: &xs, x_g: &x_gs, steps_left: &ks, actions: &actions, mask: &masks };
     let ours = OuterLoop::new(config.clone(), threads).run(&variables, samples);
     let Named(variables) = variables;
 

@@ -42,6 +42,7 @@ fn batch(config: &ModelConfig, seed: u64) -> Batch {
         frames,
         observations: vec![0, 1, 2, 0, 1, 3],
         goals: vec![3, 3, 3, 2, 2, 3],
+        steps_left: vec![3, 2, 1, 40, 60, 200],
         actions: floats(samples * config.actions as usize, seed + 1).collect(),
         mask: floats(samples, seed + 2).map(|value| f32::from(value > -0.6)).collect(),
     }

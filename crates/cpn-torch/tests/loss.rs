@@ -16,6 +16,7 @@ fn batch(config: &ModelConfig) -> Batch {
         frames: Frames::Images(noise_images(7, 1)),
         observations: vec![0, 1, 2, 3, 4, 0, 5, 5],
         goals: vec![6, 6, 6, 6, 6, 5, 4, 6],
+        steps_left: vec![90, 75, 60, 45, 30, 15, 1, 200],
         actions: floats(samples * config.actions as usize, 3).collect(),
         mask: floats(samples, 4).map(|value| f32::from(value > -0.6)).collect(),
     }

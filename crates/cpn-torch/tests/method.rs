@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{new_agent, noise_images, paired, uniform};
+use common::{new_agent, noise_images, paired, steps_left, uniform};
 use cpn::{EncoderConfig, MethodKind, Model, ModelConfig};
 use cpn_torch::inner_loop::InnerLoop;
 use cpn_torch::loss::TensorBatch;
@@ -88,9 +88,10 @@ fn a_plan_does_not_depend_on_its_batch() {
     for method in MethodKind::ALL {
         let agent = new_agent(small_config(method));
         let (x, x_g) = (uniform(&[7, 6], 1), uniform(&[7, 6], 2));
-        let together = agent.plan(&x, &x_g);
+        let together = agent.plan(&x, &x_g, &steps_left(7));
         for row in 0..7 {
-            let alone = agent.plan(&x.narrow(0, row, 1), &x_g.narrow(0, row, 1));
+            let [x, x_g, steps_left] = [&x, &x_g, &steps_left(7)].map(|rows| rows.narrow(0, row, 1));
+            let alone = agent.plan(&x, &x_g, &steps_left);
             assert!(max_difference(&alone.actions, &together.actions.narrow(0, row, 1)) < ROUNDING, "{method}");
             for (a, b) in alone.inner_losses.iter().zip(&together.inner_losses) {
                 assert!(max_difference(a, &b.narrow(0, row, 1)) < ROUNDING, "{method}");
@@ -156,14 +157,18 @@ fn a_layer_without_attenuation_is_linear() {
 }
 
 #[test]
-fn methods_depend_on_the_goal_as_configured() {
+fn methods_depend_on_their_inputs_as_configured() {
     for method in MethodKind::ALL {
         let agent = new_agent(small_config(method));
-        let [x, goal_a, goal_b] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
-        let change = max_difference(&agent.plan(&x, &goal_a).actions, &agent.plan(&x, &goal_b).actions);
-        assert_eq!(change > 0.0, method != MethodKind::Bc, "{method}: only BC ignores the goal");
-        let moved = agent.plan(&(&x + 0.1), &goal_a).actions;
-        assert!(max_difference(&moved, &agent.plan(&x, &goal_a).actions) > 0.0, "{method}");
+        let [x, goal, other_goal] = [1, 2, 3].map(|seed| uniform(&[4, 6], seed));
+        let steps_left = steps_left(4);
+        let actions = agent.plan(&x, &goal, &steps_left).actions;
+        let change = |x: &Tensor, x_g: &Tensor, k: &Tensor| max_difference(&agent.plan(x, x_g, k).actions, &actions);
+        assert!(change(&(&x + 0.1), &goal, &steps_left) > 0.0, "{method}");
+        let by_goal = change(&x, &other_goal, &steps_left);
+        assert_eq!(by_goal > 0.0, method != MethodKind::Bc, "{method}: only BC ignores the goal");
+        let by_steps_left = change(&x, &goal, &(&steps_left + 0.1));
+        assert_eq!(by_steps_left > 0.0, method == MethodKind::TeBcHorizon, "{method}: no other takes the steps left");
     }
 }
 
@@ -204,7 +209,8 @@ fn every_preset_builds() {
             };
             let x = agent.encode(&inputs);
             assert_eq!(x.size(), [2, encoder.latent()]);
-            assert_eq!(agent.plan(&x, &x).actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
+            let plan = agent.plan(&x, &x, &steps_left(2).to_kind(Kind::Float));
+            assert_eq!(plan.actions.size(), [2, if method.plans() { 5 } else { 1 }, 4]);
         }
     }
 }

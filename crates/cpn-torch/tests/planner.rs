@@ -61,9 +61,14 @@ fn embeddings(rows: usize, latent: i64, seed: u64) -> (Vec<Vec<f32>>, Tensor) {
     ((0..rows as i64).map(row).collect(), values.to_kind(Kind::Double))
 }
 
+/// Numbers of steps left in [`queries`]: some are beyond the longest that is told apart.
+fn steps_left(rows: usize) -> impl Iterator<Item = u32> {
+    (0..rows as u32).map(|row| 1 + 7 * row)
+}
+
 fn queries<'a>(x: &'a [Vec<f32>], x_g: &'a [Vec<f32>], start: &'a [Vec<f32>]) -> Vec<Query<'a>> {
-    let seeds = 0..x.len() as u64;
-    x.iter().zip(x_g).zip(seeds).map(|((x, x_g), seed)| Query { x, x_g, seed, start }).collect()
+    let rows = x.iter().zip(x_g).zip(steps_left(x.len())).zip(0..);
+    rows.map(|(((x, x_g), steps_left), seed)| Query { x, x_g, steps_left, seed, start }).collect()
 }
 
 fn fixed<'a>(solver: Solver, count: usize) -> Search<'a> {
@@ -86,9 +91,7 @@ fn farthest(a: &[f64], b: &[f64]) -> f64 {
 }
 
 fn sizes() -> impl Strategy<Value = ModelConfig> {
-    let method =
-        prop_oneof![Just(MethodKind::Upn), Just(MethodKind::Cpn), Just(MethodKind::TeBc), Just(MethodKind::Bc)];
-    (method, 1i64..70, 1i64..40, 1i64..40, 1i64..6, 1i64..9, 0i64..4).prop_map(
+    (proptest::sample::select(&MethodKind::ALL[..]), 1i64..70, 1i64..40, 1i64..40, 1i64..6, 1i64..9, 0i64..4).prop_map(
         |(method, latent, hidden, gate_hidden, actions, horizon, updates)| {
             let mut config = position_config(method);
             if let EncoderConfig::Position(encoder) = &mut config.encoder {
@@ -103,12 +106,12 @@ fn sizes() -> impl Strategy<Value = ModelConfig> {
 /// Plans from perturbed embeddings, `[2 DIRECTIONS B]`: their differences from the plan bound the effect of rounding in float32. A
 /// rollout can be steep, and the gradient is discontinuous where a rectified linear unit switches; each direction is taken with
 /// both signs, so that one of them switches the units that rounding may switch.
-fn perturbed(agent: &Agent, x: &Tensor, x_g: &Tensor) -> TensorPlan {
+fn perturbed(agent: &Agent, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> TensorPlan {
     let around = |tensor: &Tensor, seed: u64| {
         let perturbations = (0..DIRECTIONS).map(|direction| uniform(&tensor.size(), seed + 2 * direction) * ROUNDING);
         Tensor::cat(&perturbations.flat_map(|by| [tensor + &by, tensor - by]).collect::<Vec<_>>(), 0)
     };
-    agent.plan(&around(x, 0), &around(x_g, 1))
+    agent.plan(&around(x, 0), &around(x_g, 1), &steps_left.repeat([2 * DIRECTIONS as i64]))
 }
 
 /// Actions and inner losses of a batch's plan.
@@ -126,8 +129,9 @@ proptest! {
         let model = model(config, 0.05);
         let agent = double_agent(&model);
         let ((x, xs), (x_g, x_gs)) = (embeddings(rows, latent, seed), embeddings(rows, latent, seed + 1));
-        let reference = agent.plan(&xs, &x_gs);
-        let others = perturbed(&agent, &xs, &x_gs);
+        let steps_left = tensors::from_steps_left(steps_left(rows)).to_kind(Kind::Double);
+        let reference = agent.plan(&xs, &x_gs, &steps_left);
+        let others = perturbed(&agent, &xs, &x_gs, &steps_left);
 
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
@@ -230,7 +234,7 @@ fn positions_are_not_rounded_to_bfloat16() {
 /// Bit for bit, for all batches and solvers; for the native engine also for all numbers of threads.
 #[test]
 fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
-    for method in [MethodKind::Cpn, MethodKind::Upn, MethodKind::TeBc] {
+    for method in [MethodKind::Cpn, MethodKind::Upn, MethodKind::TeBc, MethodKind::TeBcHorizon] {
         let config = ModelConfig { updates: if method.plans() { 2 } else { 0 }, ..ModelConfig::paper(method) };
         let (latent, plans) = (config.encoder.latent(), method.plans());
         let model = model(config, 0.5);
@@ -258,6 +262,22 @@ fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
             for (frame, x) in frames.iter().zip(&all) {
                 assert_eq!(planner.encode(&[*frame]), std::slice::from_ref(x), "{engine:?}");
             }
+        }
+    }
+}
+
+#[test]
+fn a_method_that_takes_the_steps_left_depends_on_them_and_no_other_does() {
+    let ((x, _), (x_g, _)) = (embeddings(1, 6, 1), embeddings(1, 6, 2));
+    for engine in engines() {
+        for method in MethodKind::ALL {
+            let mut planner = planner(&*engine, &model(small_config(method), 0.1));
+            let mut actions = |steps_left| {
+                let query = Query { x: &x[0], x_g: &x_g[0], steps_left, seed: 0, start: &[] };
+                planner.plan(&[query], &mut fixed(Solver::Gradient, 1)).remove(0).actions
+            };
+            let changes = actions(3) != actions(4);
+            assert_eq!([changes, planner.takes_steps_left()], [method.takes_steps_left(); 2], "{engine:?} {method}");
         }
     }
 }
@@ -440,7 +460,7 @@ fn a_search_starts_from_the_actions_it_is_given() {
 fn random_actions_follow_the_seed() {
     let mut random = Random { actions: 4 };
     let mut plan = |seed| {
-        let query = Query { x: &[], x_g: &[], seed, start: &[] };
+        let query = Query { x: &[], x_g: &[], steps_left: 0, seed, start: &[] };
         random.plan(&[query], &mut fixed(Solver::Gradient, 0)).remove(0).actions
     };
     assert_eq!(plan(1), plan(1));

@@ -11,6 +11,8 @@ pub struct Batch {
     pub observations: Vec<usize>,
     /// Index of each sample's goal among the frames, `[B]`.
     pub goals: Vec<usize>,
+    /// Number of steps from each sample's observation to its goal, `[B]`.
+    pub steps_left: Vec<u32>,
     /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Vec<f32>,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.

@@ -6,7 +6,8 @@ use std::fmt;
 /// Maximum distance of a position from the origin on each axis: 1 km, in millimetres.
 const MAX_MM: i64 = 1_000_000;
 
-/// A learned method of the paper's comparison (section "Methods for comparison").
+/// A learned method: those of the paper's comparison (section "Methods for comparison"), and behaviour cloning with the remaining
+/// horizon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MethodKind {
@@ -14,6 +15,9 @@ pub enum MethodKind {
     Bc,
     /// Behaviour cloning conditioned on the goal's embedding.
     TeBc,
+    /// Behaviour cloning conditioned on the goal's embedding and the number of steps left to it: the goal-conditioned inverse
+    /// dynamics model of arXiv 2605.08732.
+    TeBcHorizon,
     /// Universal planning network: planning, without goal conditioning or neuromodulation.
     Upn,
     /// Contextual planning network: planning, conditioned on the goal's embedding, with neuromodulated layers.
@@ -22,11 +26,16 @@ pub enum MethodKind {
 
 impl MethodKind {
     /// Every learned method, in the paper's order.
-    pub const ALL: [Self; 4] = [Self::Bc, Self::TeBc, Self::Upn, Self::Cpn];
+    pub const ALL: [Self; 5] = [Self::Bc, Self::TeBc, Self::TeBcHorizon, Self::Upn, Self::Cpn];
 
     /// True if the goal's embedding is an input of g_θ.
     pub fn is_goal_conditioned(self) -> bool {
-        matches!(self, Self::TeBc | Self::Cpn)
+        matches!(self, Self::TeBc | Self::TeBcHorizon | Self::Cpn)
+    }
+
+    /// True if the number of steps left to the goal is an input of g_θ.
+    pub fn takes_steps_left(self) -> bool {
+        self == Self::TeBcHorizon
     }
 
     /// True if actions come from the inner loop.
@@ -44,6 +53,7 @@ impl MethodKind {
         match self {
             Self::Bc => "bc",
             Self::TeBc => "te-bc",
+            Self::TeBcHorizon => "te-bc-horizon",
             Self::Upn => "upn",
             Self::Cpn => "cpn",
         }
@@ -223,6 +233,13 @@ impl ModelConfig {
     pub fn paper(method: MethodKind) -> Self {
         let (horizon, updates) = if method.plans() { (5, 1) } else { (1, 0) };
         Self { method, encoder: EncoderConfig::paper(), hidden: 32, gate_hidden: 32, actions: 4, horizon, updates }
+    }
+
+    /// Width of the input of g_θ's trunk: x, x_g if the method is goal-conditioned, and k if it takes the number of steps left.
+    pub fn trunk_inputs(&self) -> i64 {
+        let latent = self.encoder.latent();
+        let goal = if self.method.is_goal_conditioned() { latent } else { 0 };
+        latent + goal + i64::from(self.method.takes_steps_left())
     }
 
     /// Checks every value against its range. The ranges bound a model's weights to a few hundred megabytes, so that a model can be

@@ -16,6 +16,7 @@
 //! | A | `actions` | continuous actions of the robot |
 //! | o_t, o_g | `observation`, `goal` | images, `[B, 84, 84, 3]`, 8 bits; or positions, `[B, 3]`, metres |
 //! | x_t, x_g | `x`, `x_g` | their embeddings, `[B, Z]` |
+//! | k | `steps_left` | scaled number of steps left to the goal, `[B]`; beside the paper |
 //! | â_{t:t+H} | `Plan::actions` | planned actions, `[B, H, A]` |
 //!
 //! Files are validated once, in [`checkpoint::from_bytes`]; a wrong shape after that is a bug and panics.
@@ -34,6 +35,7 @@ pub mod positions;
 mod precision;
 pub mod recipe;
 pub mod search;
+pub mod steps_left;
 mod unique;
 
 pub use batch::Batch;

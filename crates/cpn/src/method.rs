@@ -12,7 +12,7 @@ pub use crate::search::{Iterations, Plan, Query, Search, Solver, rollouts};
 /// A control policy: from embeddings of an observation and a goal to a plan of actions. Model predictive control applies the first
 /// action of each plan, and plans again at the next step.
 pub trait Method: Send {
-    /// Short name of the method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    /// Short name of the method: `random`, `bc`, `te-bc`, `te-bc-horizon`, `upn` or `cpn`.
     fn name(&self) -> &'static str;
 
     /// H, the planning horizon.
@@ -27,6 +27,11 @@ pub trait Method: Send {
 
     /// True if observations and goals of this kind can be embedded.
     fn takes(&self, input: Input) -> bool;
+
+    /// True if plans depend on [`Query::steps_left`].
+    fn takes_steps_left(&self) -> bool {
+        false
+    }
 
     /// Embeddings of observations or goals of a kind that it takes, `[Z]` each; Z is 0 for a method that ignores them. An embedding
     /// does not depend on the rest of the batch.

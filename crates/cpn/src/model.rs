@@ -129,9 +129,8 @@ impl Parameters {
     fn network(&mut self, config: &ModelConfig) {
         let ModelConfig { method, hidden, actions, .. } = *config;
         let latent = config.encoder.latent();
-        let context = if method.is_goal_conditioned() { latent } else { 0 };
 
-        self.dense("network.trunk", latent + context, hidden, config);
+        self.dense("network.trunk", config.trunk_inputs(), hidden, config);
         self.dense("network.policy_0", hidden, hidden, config);
         self.dense("network.policy_1", hidden, actions, config);
         if method.plans() {

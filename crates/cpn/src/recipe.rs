@@ -61,6 +61,8 @@ pub enum Preset {
     PaperBc,
     /// Behaviour cloning with task embedding, as in the paper.
     PaperTeBc,
+    /// Behaviour cloning with task embedding and remaining horizon: the paper's settings, with goals in hindsight.
+    PaperTeBcHorizon,
     /// Universal planning network, as in the paper.
     PaperUpn,
     /// Contextual planning network, as in the paper.
@@ -79,13 +81,22 @@ const JENGA_SCALE_MM: i64 = 62;
 
 impl Preset {
     /// All presets, in the order of lists.
-    pub const ALL: [Self; 6] = [Self::PaperBc, Self::PaperTeBc, Self::PaperUpn, Self::PaperCpn, Self::Cpn, Self::Jenga];
+    pub const ALL: [Self; 7] = [
+        Self::PaperBc,
+        Self::PaperTeBc,
+        Self::PaperTeBcHorizon,
+        Self::PaperUpn,
+        Self::PaperCpn,
+        Self::Cpn,
+        Self::Jenga,
+    ];
 
     /// Name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::PaperBc => "paper-bc",
             Self::PaperTeBc => "paper-te-bc",
+            Self::PaperTeBcHorizon => "paper-te-bc-horizon",
             Self::PaperUpn => "paper-upn",
             Self::PaperCpn => "paper-cpn",
             Self::Cpn => "cpn",
@@ -99,6 +110,11 @@ impl Preset {
         match self {
             Self::PaperBc => paper(MethodKind::Bc),
             Self::PaperTeBc => paper(MethodKind::TeBc),
+            Self::PaperTeBcHorizon => Recipe {
+                model: ModelConfig::paper(MethodKind::TeBcHorizon),
+                // With final goals, the number of steps left would be all but a clock of the demonstration.
+                training: Training { goals: GoalSampling::Hindsight, ..Training::paper() },
+            },
             Self::PaperUpn => paper(MethodKind::Upn),
             Self::PaperCpn => paper(MethodKind::Cpn),
             Self::Cpn => Recipe {

@@ -117,7 +117,7 @@ fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: 
         let xs = planner.encode(&indices.iter().map(|index| frames[*index]).collect::<Vec<_>>());
         let encoded = Instant::now();
         let ends = xs.iter().zip(indices.iter().map(|index| &x_gs[*index]));
-        let queries: Vec<_> = ends.map(|(x, x_g)| Query { x, x_g, seed: 0, start: &[] }).collect();
+        let queries: Vec<_> = ends.map(|(x, x_g)| Query { x, x_g, steps_left: 1, seed: 0, start: &[] }).collect();
         let iterations = Iterations::Fixed(model.config.updates as usize);
         let plans = planner.plan(&queries, &mut Search { solver: Solver::Gradient, iterations });
         encoding += (encoded - started).as_secs_f64();

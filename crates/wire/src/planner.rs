@@ -9,6 +9,8 @@ use std::time::Duration;
 const MAX_HORIZON: usize = 64;
 /// Largest absolute value in a warm start; executed actions are clipped to [-1, 1].
 const MAX_WARM_START: f32 = 1000.0;
+/// Largest number of steps left.
+pub const MAX_STEPS_LEFT: u32 = 10_000;
 
 /// Goal of a plan.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,6 +42,8 @@ pub struct PlanRequest {
     pub search: Option<Search>,
     /// Initial plan of the search, `[horizon, actions]`; the policy's plan if empty.
     pub warm_start: Vec<Vec<f32>>,
+    /// Number of steps that remain for the task, 1 to [`MAX_STEPS_LEFT`]; required by models that take it, ignored by others.
+    pub steps_left: Option<u32>,
 }
 
 /// Plan.
@@ -144,7 +148,7 @@ pub struct ListModelsResponse {
 pub struct ModelInfo {
     /// Name it is served under.
     pub name: String,
-    /// Method: `random`, `bc`, `te-bc`, `upn` or `cpn`.
+    /// Method: `random`, `bc`, `te-bc`, `te-bc-horizon`, `upn` or `cpn`.
     pub method: String,
     /// SHA-256 of its checkpoint, in hex.
     pub digest: String,
@@ -172,6 +176,15 @@ fn warm_start(field: &str, plan: Vec<proto::Action>) -> Result<Vec<Vec<f32>>, Er
     }
 }
 
+/// Validates a number of steps left.
+fn steps_left(field: &str, steps: u32) -> Result<u32, Error> {
+    if (1..=MAX_STEPS_LEFT).contains(&steps) {
+        Ok(steps)
+    } else {
+        Err(Error::invalid(field, format!("1 to {MAX_STEPS_LEFT}"), steps))
+    }
+}
+
 impl PlanRequest {
     /// Request with the model's default search, seed 0, and no deadline.
     pub fn new(model: impl Into<String>, goal: Goal, observation: Observation) -> Self {
@@ -184,6 +197,7 @@ impl PlanRequest {
             model_digest: None,
             search: None,
             warm_start: Vec::new(),
+            steps_left: None,
         }
     }
 }
@@ -231,6 +245,7 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
                 .transpose()?,
             search,
             warm_start: warm_start("warm_start", request.warm_start)?,
+            steps_left: request.steps_left.map(|steps| steps_left("steps_left", steps)).transpose()?,
         })
     }
 }
@@ -253,6 +268,7 @@ impl From<PlanRequest> for proto::PlanRequest {
             model_digest: request.model_digest.unwrap_or_default(),
             search: request.search.map(Into::into),
             warm_start: request.warm_start.into_iter().map(|values| proto::Action { values }).collect(),
+            steps_left: request.steps_left,
         }
     }
 }

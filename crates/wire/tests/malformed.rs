@@ -50,7 +50,7 @@ fn each_wrong_field_is_named() {
         Some(proto::Search { solver: solver.into(), samples, anytime, ..Default::default() })
     };
     let action = |count| proto::Action { values: vec![0.0; count] };
-    let cases: [(Error, &str, &str, &str); 18] = [
+    let cases: [(Error, &str, &str, &str); 20] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -99,6 +99,8 @@ fn each_wrong_field_is_named() {
             "numbers from -1000 to 1000",
             "-10000",
         ),
+        (refusal(|r| r.steps_left = Some(0)), "steps_left", "1 to 10000", "0"),
+        (refusal(|r| r.steps_left = Some(10_001)), "steps_left", "1 to 10000", "10001"),
     ];
     for (error, field, expected, got) in cases {
         assert_eq!(error.code, Code::InvalidArgument);

@@ -144,10 +144,11 @@ proptest! {
         model_digest in option::of(digest()),
         search in option::of(search()),
         warm_start in vec(action(), 0..6),
+        steps_left in option::of(1..=MAX_STEPS_LEFT),
     ) {
         // An anytime search needs a deadline.
         let deadline = deadline.or_else(|| search?.anytime.then_some(Duration::from_millis(1)));
-        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start });
+        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left });
     }
 
     #[test]

@@ -15,7 +15,7 @@ def dry_run(folder: Path, profile: str, *options: str) -> subprocess.CompletedPr
     return subprocess.run([*command, "--dry-run", *options], text=True, capture_output=True)
 
 
-@pytest.mark.parametrize(("profile", "training", "evaluation"), [("desk", 96, 360), ("paper", 288, 936)])
+@pytest.mark.parametrize(("profile", "training", "evaluation"), [("desk", 120, 384), ("paper", 360, 1008)])
 def test_a_profile_has_the_jobs_of_its_folds_methods_and_seeds(
     tmp_path: Path, profile: str, training: int, evaluation: int
 ) -> None:

@@ -56,7 +56,7 @@ static EXAMPLES: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
         latent: 2,
         layer_norm: true,
     });
-    [(MethodKind::TeBc, image), (MethodKind::Cpn, position)].map(|(method, encoder)| example(method, encoder))
+    [(MethodKind::TeBcHorizon, image), (MethodKind::Cpn, position)].map(|(method, encoder)| example(method, encoder))
 });
 
 fn example(method: MethodKind, encoder: EncoderConfig) -> Vec<u8> {

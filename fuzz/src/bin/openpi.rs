@@ -28,7 +28,7 @@ fn requests() -> Vec<Vec<u8>> {
     let observed = [("observation/image", picture()), ("observation/position", position())];
     let goals = [("goal/image", picture()), ("goal/position", position()), ("goal/id", goal_id())];
     let pairs = observed.iter().flat_map(|observed| goals.iter().map(move |goal| [observed.clone(), goal.clone()]));
-    let others = || [("model", "cpn".into()), ("seed", 7.into()), ("prompt", "".into())];
+    let others = || [("model", "cpn".into()), ("seed", 7.into()), ("steps_left", 70.into()), ("prompt", "".into())];
     pairs.map(|pair| packed(pair.into_iter().chain(others()))).collect()
 }
 

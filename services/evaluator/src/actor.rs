@@ -88,7 +88,8 @@ impl Planned<'_> {
     async fn decide(&mut self, reset: &ResetResponse, step: u32, observation: Observation) -> Result<Decided, Fault> {
         let by_planner = |error| Fault::new(self.planner.clone(), error);
         let (goal, seed) = (self.goal.clone(), plan_seed(self.seed, step));
-        let request = self.link.plan_request(self.model, self.planning, goal, observation, seed);
+        let steps_left = self.planning.steps_left(reset.max_steps, step);
+        let request = self.link.plan_request(self.model, self.planning, goal, observation, seed, steps_left);
         let request = PlanRequest { warm_start: std::mem::take(&mut self.warm_start), ..request };
 
         let asked = self.start.elapsed();
@@ -149,6 +150,7 @@ impl Link {
         goal: Goal,
         observation: Observation,
         seed: u64,
+        steps_left: u32,
     ) -> PlanRequest {
         PlanRequest {
             search: planning.search().filter(|_| model.plans()),
@@ -156,6 +158,8 @@ impl Link {
             deadline: Some(self.timeout),
             // The one that the run began with, though the planner may swap.
             model_digest: Some(model.digest.clone()),
+            // Of every model: those that do not take it ignore it.
+            steps_left: Some(steps_left),
             ..PlanRequest::new(&model.name, goal, observation)
         }
     }

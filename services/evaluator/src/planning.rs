@@ -3,7 +3,7 @@
 use clap::{Args, ValueEnum, value_parser};
 use serde::{Deserialize, Serialize};
 use std::fmt;
-use wire::planner::Search;
+use wire::planner::{MAX_STEPS_LEFT, Search};
 use wire::{Error, proto};
 
 /// Plans in closed loop: the search for them, and how they are carried out. By default each model searches in its own way, and
@@ -34,11 +34,24 @@ pub struct Planning {
     /// reports: queueing, encoding and planning.
     #[arg(long, conflicts_with = "apply_actions")]
     pub real_time: bool,
+    /// Number of steps of a task, from which the number of steps left is counted down, of models that take it; it stays 1 after
+    /// these steps [default: the maximum of an episode].
+    #[arg(long, value_parser = value_parser!(u32).range(1..=i64::from(MAX_STEPS_LEFT)))]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_steps: Option<u32>,
 }
 
 impl Default for Planning {
     fn default() -> Self {
-        Self { solver: None, updates: None, samples: None, warm_start: false, apply_actions: 1, real_time: false }
+        Self {
+            solver: None,
+            updates: None,
+            samples: None,
+            warm_start: false,
+            apply_actions: 1,
+            real_time: false,
+            task_steps: None,
+        }
     }
 }
 
@@ -59,6 +72,11 @@ impl Planning {
         })
     }
 
+    /// Number of steps left after `step` steps of an episode of at most `max_steps`, at least one.
+    pub(crate) fn steps_left(&self, max_steps: u32, step: u32) -> u32 {
+        self.task_steps.unwrap_or(max_steps).saturating_sub(step).clamp(1, MAX_STEPS_LEFT)
+    }
+
     /// Checks the search by the rules of the wire.
     ///
     /// # Errors
@@ -71,7 +89,7 @@ impl Planning {
 /// The options that were given, as they are typed.
 impl fmt::Display for Planning {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { solver, updates, samples, warm_start, apply_actions, real_time } = self;
+        let Self { solver, updates, samples, warm_start, apply_actions, real_time, task_steps } = self;
         let options = [
             solver.and_then(|solver| Some(format!("--solver {}", solver.to_possible_value()?.get_name()))),
             updates.map(|updates| format!("--updates {updates}")),
@@ -79,6 +97,7 @@ impl fmt::Display for Planning {
             warm_start.then(|| "--warm-start".into()),
             (*apply_actions != 1).then(|| format!("--apply-actions {apply_actions}")),
             real_time.then(|| "--real-time".into()),
+            task_steps.map(|steps| format!("--task-steps {steps}")),
         ];
         let given: Vec<_> = options.into_iter().flatten().collect();
         if given.is_empty() { write!(f, "default planning") } else { write!(f, "{}", given.join(" ")) }
@@ -119,10 +138,10 @@ mod tests {
     fn records_without_settings_are_of_the_default() {
         assert_eq!(serde_json::from_str::<Planning>("{}").unwrap(), Planning::default());
         assert_eq!(Planning::default().search(), None);
-        let planning = Planning { updates: Some(0), warm_start: true, ..Planning::default() };
+        let planning = Planning { updates: Some(0), warm_start: true, task_steps: Some(70), ..Planning::default() };
         let json = serde_json::to_string(&planning).unwrap();
         assert_eq!(serde_json::from_str::<Planning>(&json).unwrap(), planning);
-        assert_eq!(planning.to_string(), "--updates 0 --warm-start");
+        assert_eq!(planning.to_string(), "--updates 0 --warm-start --task-steps 70");
         assert_eq!(planning.search().unwrap().iterations, Some(0));
     }
 

@@ -83,7 +83,7 @@ pub enum GoalSource {
 pub struct Model {
     /// Name it is served under.
     pub name: String,
-    /// `random`, `bc`, `te-bc`, `upn` or `cpn`; `no-op` or `oracle` for a control of the evaluator's own.
+    /// `random`, `bc`, `te-bc`, `te-bc-horizon`, `upn` or `cpn`; `no-op` or `oracle` for a control of the evaluator's own.
     pub method: String,
     /// SHA-256 of its checkpoint, in hex; empty for a control of the evaluator's own.
     pub digest: String,

@@ -159,6 +159,7 @@ mod tests {
             model_digest: None,
             search,
             warm_start: vec![vec![0.5; 3]; 2],
+            steps_left: Some(9),
         };
         let response = PlanResponse {
             actions: vec![vec![0.5, -2.0, 0.0]; 2],
@@ -183,7 +184,7 @@ mod tests {
         let request = again(&goal, &recorded);
         assert_eq!(request.search, Some(Search { iterations: Some(2), anytime: false, ..anytime }));
         assert_eq!((request.deadline, request.model_digest), (None, Some("0".repeat(64))));
-        assert_eq!((request.seed, request.warm_start), (7, vec![vec![0.5; 3]; 2]));
+        assert_eq!((request.seed, request.warm_start, request.steps_left), (7, vec![vec![0.5; 3]; 2], Some(9)));
         // A fixed number of updates answers the last plan, and tells the losses of all.
         let now = |losses: [f32; 3]| PlanResponse { inner_losses: losses.into(), ..recorded.response.clone() };
         assert_eq!(compare(0, &recorded, now([3.0, 5.0, 1.0])), None);

@@ -116,7 +116,8 @@ async fn check_variation(
         let by_planner = |error| (model.name.clone(), Fault::new(planner.clone(), error));
         let goal = link.goal(&planner, &reset).await.map_err(by_planner)?;
         let observation = actor::observed(&reset, &reset.observation, reset.hand_position);
-        let request = link.plan_request(model, &run.planning, goal, observation, actor::plan_seed(variation.seed, 0));
+        let (seed, steps_left) = (actor::plan_seed(variation.seed, 0), run.planning.steps_left(reset.max_steps, 0));
+        let request = link.plan_request(model, &run.planning, goal, observation, seed, steps_left);
         link.plan(&planner, request).await.map_err(by_planner)?;
     }
     Ok(())
@@ -443,6 +444,13 @@ mod tests {
         assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));
         let tenths = |action: &Vec<f32>| (10.0 * action[0]).round() as i32;
         assert_eq!(recording.exchanges()[1].request.warm_start.iter().map(tenths).collect::<Vec<_>>(), [2, 2, 2]);
+        // The steps left are counted from those of the episode, or of the task.
+        let steps_left = |recording: Recording| -> Vec<_> {
+            recording.exchanges().iter().map(|exchange| exchange.request.steps_left.unwrap()).collect()
+        };
+        assert_eq!(steps_left(planned(default).await.2), [5, 4, 3]);
+        assert_eq!(steps_left(planned(Planning { apply_actions: 2, ..default }).await.2), [5, 3]);
+        assert_eq!(steps_left(planned(Planning { task_steps: Some(2), ..default }).await.2), [2, 1, 1]);
         // A plan takes half a second here, five steps of the simulation: none acts before the episode ends.
         let (applied, steps, recording) = planned(Planning { real_time: true, ..default }).await;
         assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 0, 0], vec![], 1));

@@ -76,11 +76,11 @@ impl PlannerCore {
     /// Plans actions towards the goal with the named model. A goal that is not an id is registered.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse; `NOT_FOUND`
-    /// for an unknown model or goal id; `FAILED_PRECONDITION` if the render specs of observation, goal and training data
-    /// differ, or the required checkpoint is not kept; `RESOURCE_EXHAUSTED` if the queue is full, or the expected wait exceeds
-    /// the deadline; `DEADLINE_EXCEEDED` once the deadline has passed; `INTERNAL` for a plan that is not finite; `UNAVAILABLE`
-    /// during shutdown.
+    /// `INVALID_ARGUMENT` for an image that is not 84 x 84, an image for a model of positions, or the reverse, or no number of
+    /// steps left for a model that takes it; `NOT_FOUND` for an unknown model or goal id; `FAILED_PRECONDITION` if
+    /// the render specs of observation, goal and training data differ, or the required checkpoint is not kept;
+    /// `RESOURCE_EXHAUSTED` if the queue is full, or the expected wait exceeds the deadline; `DEADLINE_EXCEEDED` once the deadline
+    /// has passed; `INTERNAL` for a plan that is not finite; `UNAVAILABLE` during shutdown.
     pub async fn plan(&self, request: PlanRequest) -> Result<PlanResponse, Error> {
         self.thread.plan(self.task(request)?).await
     }
@@ -95,7 +95,8 @@ impl PlannerCore {
 
     /// Resolves the names in a request and checks its images.
     fn task(&self, request: PlanRequest) -> Result<PlanTask, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start } = request;
+        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left } =
+            request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
         }
@@ -126,6 +127,7 @@ impl PlannerCore {
             deadline,
             search,
             warm_start,
+            steps_left,
             span: Span::current(),
         })
     }

@@ -281,6 +281,7 @@ mod tests {
             deadline: None,
             search,
             warm_start: Vec::new(),
+            steps_left: None,
             span: Span::none(),
         }
     }

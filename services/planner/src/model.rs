@@ -128,7 +128,7 @@ impl Model {
         let ends = self.method.encode(&ends);
         self.costs.record_embedding(2, started.elapsed());
 
-        let query = Query { x: &ends[0], x_g: &ends[1], seed: 0, start: &[] };
+        let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[] };
         let updates = self.method.updates();
         let trials = updates.map(|_| (Solver::Cem(WARM_UP_SAMPLES), 1));
         let plans = [Some((Solver::Gradient, updates.unwrap_or_default())), trials];
@@ -146,12 +146,15 @@ impl Model {
     /// Checks that a task fits the model.
     ///
     /// # Errors
-    /// If the goal or observation is of the wrong kind or has another render spec, the task has a search or warm start but the
-    /// method does not plan, or the warm start is not `[horizon, actions]`.
+    /// If the goal or observation is of the wrong kind or has another render spec, the task has no number of steps left but the
+    /// method takes it, or a search or warm start but the method does not plan, or the warm start is not `[horizon, actions]`.
     pub(crate) fn check(&self, task: &PlanTask) -> Result<(), Error> {
         self.check_takes(task.goal_field, &task.goal)?;
         self.check_takes(task.observation_field(), &task.observation)?;
         task.check_render_specs(&self.render_spec)?;
+        if self.method.takes_steps_left() && task.steps_left.is_none() {
+            return Err(Error::invalid("steps_left", "the number of steps that remain for the task", "none"));
+        }
         if self.method.updates().is_none() {
             let asked = [("search", task.search.is_some()), ("warm_start", !task.warm_start.is_empty())];
             if let Some((field, _)) = asked.into_iter().find(|(_, asked)| *asked) {

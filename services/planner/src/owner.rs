@@ -7,7 +7,7 @@ use crate::model_thread::Job;
 use crate::searches::Searches;
 use crate::served::Served;
 use crate::task::{Accepted, Answer, PlanTask, Reply, Waiting, deadline_exceeded};
-use cpn::method::{Query, rollouts};
+use cpn::method::rollouts;
 use lru::LruCache;
 use metrics::{counter, histogram};
 use std::any::Any;
@@ -264,9 +264,7 @@ impl Owner {
         let latents = encode(&mut model, embeddings, tasks);
         let encoded = started.elapsed();
 
-        let queries = tasks.iter().zip(&latents);
-        let queries = queries.map(|(task, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start });
-        let queries: Vec<_> = queries.collect();
+        let queries: Vec<_> = tasks.iter().zip(&latents).map(|(task, latents)| task.query(latents)).collect();
         let spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "search")).collect();
         let plans = model.plan(&queries, *search);
         drop(spans);

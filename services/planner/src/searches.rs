@@ -176,8 +176,5 @@ impl SlicedSearch {
 
 /// Queries of the tasks, for the method.
 fn queries<'a>(tasks: &'a [Accepted], latents: &'a [(Vec<f32>, Vec<f32>)]) -> Vec<Query<'a>> {
-    let queries = tasks.iter().zip(latents);
-    queries
-        .map(|(Accepted { task, .. }, (x, x_g))| Query { x, x_g, seed: task.seed, start: &task.warm_start })
-        .collect()
+    tasks.iter().zip(latents).map(|(Accepted { task, .. }, latents)| task.query(latents)).collect()
 }

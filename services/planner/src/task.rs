@@ -2,6 +2,7 @@
 
 use crate::load::Estimate;
 use crate::outbox::Outbox;
+use cpn::method::Query;
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -26,6 +27,8 @@ pub(crate) struct PlanTask {
     pub(crate) search: Option<Search>,
     /// Initial plan, `[H, A]` or empty.
     pub(crate) warm_start: Vec<Vec<f32>>,
+    /// Number of steps that remain for the task.
+    pub(crate) steps_left: Option<u32>,
     /// Tracing span of the request.
     pub(crate) span: Span,
 }
@@ -65,6 +68,13 @@ pub(crate) enum Reply {
 }
 
 impl PlanTask {
+    /// Query of the task, from the embeddings of its observation and goal.
+    pub(crate) fn query<'a>(&'a self, (x, x_g): &'a (Vec<f32>, Vec<f32>)) -> Query<'a> {
+        // Checked for methods that take it.
+        let steps_left = self.steps_left.unwrap_or_default();
+        Query { x, x_g, steps_left, seed: self.seed, start: &self.warm_start }
+    }
+
     /// Whether both tasks fit in one batch: same model, checkpoint, search and kind of start.
     pub(crate) fn is_compatible(&self, other: &Self) -> bool {
         let kind = |task: &Self| (task.search, task.warm_start.is_empty());

@@ -14,7 +14,7 @@ use wire::planner::{ModelInfo, PlanResponse};
 use wire::proto::plan_request::{Goal, Observed};
 use wire::{Code, Error, proto};
 
-const MODELS: [&str; 5] = ["bc", "cpn", RANDOM, "te-bc", "upn"];
+const MODELS: [&str; 6] = ["bc", "cpn", RANDOM, "te-bc", "te-bc-horizon", "upn"];
 
 async fn start() -> Fixture {
     let checkpoints = MethodKind::ALL.map(|method| (method.name(), checkpoint(method, 1)));
@@ -109,7 +109,7 @@ async fn every_transport_refuses_alike() {
         (spoiled(|r| r.goal = None), Error::invalid("goal", "a value", "none")),
         (
             spoiled(|r| r.model = "gpt".into()),
-            Error::new(Code::NotFound, "model", "one of bc, cpn, random, te-bc, upn", "gpt"),
+            Error::new(Code::NotFound, "model", "one of bc, cpn, random, te-bc, te-bc-horizon, upn", "gpt"),
         ),
         (
             spoiled(|r| r.goal = Some(Goal::GoalId(unregistered.clone()))),
@@ -135,6 +135,29 @@ async fn every_transport_refuses_alike() {
             assert_eq!((error.code, error.field.as_str()), (code, field), "{transport}: {error}");
         }
         client.plan(plan_request("cpn", 3)).await.unwrap();
+    }
+}
+
+/// The number of steps left is required by the model that takes it, whose plans depend on it, and ignored by the others.
+#[tokio::test(flavor = "multi_thread")]
+async fn every_transport_passes_the_steps_left() {
+    let fixture = start().await;
+    for client in fixture.clients() {
+        let transport = client.transport();
+        for model in MODELS {
+            let plan =
+                async |steps_left| client.plan(proto::PlanRequest { steps_left, ..plan_request(model, 3) }).await;
+            let [near, far] = [plan(Some(1)).await, plan(Some(10_000)).await].map(|plan| plan.unwrap().actions);
+            let without = plan(None).await.map(|plan| plan.actions);
+            if model == "te-bc-horizon" {
+                assert_ne!(near, far, "{transport}");
+                let expected = "the number of steps that remain for the task";
+                assert_eq!(without, Err(Error::invalid("steps_left", expected, "none")), "{transport}");
+            } else {
+                assert_eq!((&near, Ok(&near)), (&far, without.as_ref()), "{transport}, {model}");
+            }
+            assert_eq!(plan(Some(0)).await.unwrap_err(), Error::invalid("steps_left", "1 to 10000", 0), "{transport}");
+        }
     }
 }
 

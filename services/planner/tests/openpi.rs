@@ -95,8 +95,14 @@ fn position([x, y, z]: [f32; 3]) -> Value {
 }
 
 /// Fields of the request equivalent to [`plan_request`].
-fn request(model: &str, seed: u64) -> [(&str, Value); 4] {
-    [("observation/image", picture(seed)), ("goal/image", picture(0)), ("model", model.into()), ("seed", seed.into())]
+fn request(model: &str, seed: u64) -> [(&str, Value); 5] {
+    [
+        ("observation/image", picture(seed)),
+        ("goal/image", picture(0)),
+        ("model", model.into()),
+        ("seed", seed.into()),
+        ("steps_left", 40.into()),
+    ]
 }
 
 fn field<'a>(value: &'a Value, name: &str) -> &'a Value {
@@ -145,12 +151,13 @@ async fn openpi_gets_the_answers_of_the_core() {
     let [core, ..] = fixture.clients();
     let mut client = Client::of(&fixture).await;
 
-    for model in ["bc", "cpn", "far", RANDOM, "te-bc", "upn"] {
+    for model in ["bc", "cpn", "far", RANDOM, "te-bc", "te-bc-horizon", "upn"] {
         let plan = core.plan(plan_request(model, 3)).await.unwrap();
         let by_image = client.infer(packed(&request(model, 3))).await.unwrap();
         assert_same(&by_image, &plan);
         let by_id = [("observation/image", picture(3)), ("goal/id", plan.goal_id.as_str().into()), ("seed", 3.into())];
-        let by_id = [&by_id[..], &[("model", model.into()), ("prompt", "".into())]].concat();
+        let others = [("model", model.into()), ("steps_left", 40.into()), ("prompt", "".into())];
+        let by_id = [&by_id[..], &others].concat();
         assert_same(&client.infer(packed(&by_id)).await.unwrap(), &plan);
     }
     let far = client.infer(packed(&request("far", 3))).await.unwrap();
@@ -166,7 +173,7 @@ async fn openpi_gets_the_answers_of_the_core() {
     assert_same(&client.infer(packed(&between_positions)).await.unwrap(), &plan);
 
     let models = field(&client.metadata, "models");
-    assert_eq!(keys(models), ["bc", "cpn", "far", "jenga", RANDOM, "te-bc", "upn"]);
+    assert_eq!(keys(models), ["bc", "cpn", "far", "jenga", RANDOM, "te-bc", "te-bc-horizon", "upn"]);
     assert_eq!(field(field(models, "cpn"), "horizon").as_u64(), Some(5));
     assert_eq!(field(field(models, "jenga"), "digest").as_str(), Some(&*plan.model_digest));
     assert_eq!(field(&client.metadata, "image_shape").as_array().unwrap()[..], [84, 84, 3].map(Value::from));
@@ -344,6 +351,8 @@ async fn invalid_requests_are_refused_and_the_next_is_answered() {
         ("model", 7.into(), "model: expected text, got 7".into()),
         ("model", "jenga".into(), "goal/image: expected a position, got an image".into()),
         ("seed", (-1).into(), "seed: expected an integer from 0 to 2^64 - 1, got -1".into()),
+        ("steps_left", 0.into(), "steps_left: expected an integer from 1 to 10000, got 0".into()),
+        ("steps_left", 10_001.into(), "steps_left: expected an integer from 1 to 10000, got 10001".into()),
         (
             "prompt",
             "close the drawer".into(),
@@ -353,7 +362,7 @@ async fn invalid_requests_are_refused_and_the_next_is_answered() {
             "observation/state",
             position([0.0; 3]),
             "payload: expected fields among observation/image, observation/position, goal/image, goal/position, goal/id, \
-             model, seed, prompt, got observation/state"
+             model, seed, steps_left, prompt, got observation/state"
                 .into(),
         ),
     ];

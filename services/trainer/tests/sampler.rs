@@ -65,7 +65,7 @@ fn goals_follow_the_recipe() {
     assert!(farthest > 10 && at_the_end < all / 2, "{farthest} {at_the_end}");
 }
 
-/// Frames, actions and mask of a batch against the recordings.
+/// Frames, numbers of steps left, actions and mask of a batch against the recordings.
 #[test]
 fn a_batch_matches_the_recordings() {
     let dataset = dataset();
@@ -87,6 +87,7 @@ fn a_batch_matches_the_recordings() {
                 let Observed::Image(pixels) = frames[index[row]] else { panic!("an image") };
                 assert_eq!(pixels, recorded(number).frame.data());
             }
+            assert_eq!(batch.steps_left[row], s.goal - s.step);
             for t in 0..horizon {
                 let steps = (s.step + t * block as u32..s.step + (t + 1) * block as u32).filter(|n| *n < s.goal);
                 let recorded: Vec<_> = steps.map(|n| recorded(n).action.unwrap()).collect();

@@ -29,6 +29,11 @@ pub fn uniform(shape: &[i64], seed: u64) -> Tensor {
     Tensor::from_slice(&testing::uniform(shape.iter().product::<i64>() as usize, seed)).view(shape)
 }
 
+/// k, the scaled number of steps left, `[B]`, float64: different for each sample.
+pub fn steps_left(batch: i64) -> Tensor {
+    Tensor::arange(batch, (Kind::Double, Device::Cpu)) / batch
+}
+
 /// A batch with a separate goal for each observation.
 pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Tensor) -> TensorBatch {
     let count = observations.size()[0];
@@ -37,6 +42,7 @@ pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Te
         frames: Tensor::cat(&[observations, goals], 0),
         observations: rows(0),
         goals: rows(count),
+        steps_left: steps_left(count),
         actions: actions.shallow_clone(),
         mask: mask.shallow_clone(),
     }

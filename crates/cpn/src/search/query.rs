@@ -1,12 +1,14 @@
 //! Queries for plans, settings of their search, and plans.
 
-/// Input of a search: embeddings of an observation and a goal, seed, and initial actions.
+/// Input of a search: embeddings of an observation and a goal, number of steps left, seed, and initial actions.
 #[derive(Debug, Clone, Copy)]
 pub struct Query<'a> {
     /// x, the observation's embedding, `[Z]`.
     pub x: &'a [f32],
     /// x_g, the goal's embedding, `[Z]`.
     pub x_g: &'a [f32],
+    /// Number of steps left to the goal; ignored by methods that do not take it.
+    pub steps_left: u32,
     /// Seed of the search's random numbers.
     pub seed: u64,
     /// Initial actions, `[H][A]`; the policy's if empty.

@@ -42,6 +42,7 @@ fn planner() -> Vec<Example> {
             model_digest: Some(digest()),
             search: Some(search),
             warm_start: vec![action(); 2],
+            steps_left: Some(70),
             ..plan(Goal::Id(digest()), image().into())
         }),
         example(PlanResponse {

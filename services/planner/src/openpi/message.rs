@@ -4,7 +4,7 @@ use super::numpy::{self, Array, Fields, brief};
 use crate::core::PlannerCore;
 use crate::model::RANDOM;
 use rmpv::Value;
-use wire::planner::{Goal, ListModelsResponse, ModelInfo, PlanRequest, PlanResponse, StageTimes};
+use wire::planner::{Goal, ListModelsResponse, MAX_STEPS_LEFT, ModelInfo, PlanRequest, PlanResponse, StageTimes};
 use wire::{Error, Image, Observation, Position};
 
 const OBSERVATION_IMAGE: &str = "observation/image";
@@ -14,11 +14,12 @@ const GOAL_POSITION: &str = "goal/position";
 const GOAL_ID: &str = "goal/id";
 const MODEL: &str = "model";
 const SEED: &str = "seed";
+const STEPS_LEFT: &str = "steps_left";
 const PROMPT: &str = "prompt";
 
 /// Fields of a request.
-const FIELDS: [&str; 8] =
-    [OBSERVATION_IMAGE, OBSERVATION_POSITION, GOAL_IMAGE, GOAL_POSITION, GOAL_ID, MODEL, SEED, PROMPT];
+const FIELDS: [&str; 9] =
+    [OBSERVATION_IMAGE, OBSERVATION_POSITION, GOAL_IMAGE, GOAL_POSITION, GOAL_ID, MODEL, SEED, STEPS_LEFT, PROMPT];
 
 /// Name and parser of a field.
 type Reader<T> = (&'static str, fn(Value) -> Result<T, Error>);
@@ -78,7 +79,8 @@ pub fn request(payload: &[u8], models: impl FnOnce() -> ListModelsResponse) -> R
         None => only_model(models())?,
     };
     let seed = fields.remove(SEED).map_or(Ok(0), seed).map_err(|e| e.within(SEED))?;
-    Ok(PlanRequest { seed, ..PlanRequest::new(model, goal, observation) })
+    let steps_left = fields.remove(STEPS_LEFT).map(steps_left).transpose().map_err(|e| e.within(STEPS_LEFT))?;
+    Ok(PlanRequest { seed, steps_left, ..PlanRequest::new(model, goal, observation) })
 }
 
 /// Value of the only given field among `readers`.
@@ -130,6 +132,14 @@ fn text(value: Value) -> Result<String, Error> {
 fn seed(value: Value) -> Result<u64, Error> {
     let value = numpy::scalar(value);
     value.as_u64().ok_or_else(|| Error::invalid("", "an integer from 0 to 2^64 - 1", brief(&value)))
+}
+
+fn steps_left(value: Value) -> Result<u32, Error> {
+    let value = numpy::scalar(value);
+    let steps = value.as_u64().and_then(|steps| u32::try_from(steps).ok());
+    steps
+        .filter(|steps| (1..=MAX_STEPS_LEFT).contains(steps))
+        .ok_or_else(|| Error::invalid("", format!("an integer from 1 to {MAX_STEPS_LEFT}"), brief(&value)))
 }
 
 /// Encodes an answer: the actions to execute, `[H, A]`, clipped to [-1, 1], with their provenance and timings.

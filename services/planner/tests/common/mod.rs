@@ -199,13 +199,14 @@ pub fn image(seed: u64) -> proto::Image {
     proto::Image { height: 84, width: 84, format, data: data.collect(), render_spec: String::new() }
 }
 
-/// Plan request from the image of `seed` to that of 0.
+/// Plan request from the image of `seed` to that of 0, with 40 steps left.
 pub fn plan_request(model: &str, seed: u64) -> proto::PlanRequest {
     proto::PlanRequest {
         model: model.into(),
         goal: Some(proto::plan_request::Goal::GoalImage(image(0))),
         observed: Some(proto::plan_request::Observed::Observation(image(seed))),
         seed,
+        steps_left: Some(40),
         ..Default::default()
     }
 }

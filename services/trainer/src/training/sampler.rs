@@ -117,7 +117,8 @@ impl<'a> Sampler<'a> {
                 }
             }
         }
-        Batch { frames: self.frames(step, &frames.frames), observations, goals, actions, mask }
+        let steps_left = samples.iter().map(|sample| sample.goal - sample.step).collect();
+        Batch { frames: self.frames(step, &frames.frames), observations, goals, steps_left, actions, mask }
     }
 
     /// Frames by episode and index in the dataset; images are augmented.

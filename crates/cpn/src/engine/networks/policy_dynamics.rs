@@ -32,8 +32,17 @@ pub struct Sizes {
     pub hidden: usize,
     /// A, the number of actions.
     pub actions: usize,
-    /// Width of the trunk's inputs: x, and x_g if the method is goal-conditioned.
+    /// Width of the trunk's input, [`ModelConfig::trunk_inputs`].
     pub trunk_inputs: usize,
+}
+
+/// Inputs of the trunk beside the state; a method without such inputs ignores them.
+#[derive(Debug, Clone, Copy)]
+pub struct Context<'a, T> {
+    /// x_g, `[R, Z]`.
+    pub x_g: &'a [T],
+    /// k, the scaled number of steps left, `[R]`.
+    pub steps_left: &'a [T],
 }
 
 /// Gradient of a loss in the network's weights.
@@ -82,7 +91,7 @@ impl<T: Element> PolicyDynamics<T> {
                 latent,
                 hidden,
                 actions: config.actions as usize,
-                trunk_inputs: if method.is_goal_conditioned() { 2 * latent } else { latent },
+                trunk_inputs: config.trunk_inputs() as usize,
             },
         }
     }
@@ -131,14 +140,17 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// The trunk: records features of x and x_g, `[R, Z]`, on the tape.
-    pub fn features(&self, rows: usize, step: &mut StepTape<T>, x: &[T], x_g: &[T]) {
+    /// The trunk: records features of x, `[R, Z]`, and its context on the tape.
+    pub fn features(&self, rows: usize, step: &mut StepTape<T>, x: &[T], context: Context<'_, T>) {
         let Sizes { latent, trunk_inputs, .. } = self.sizes;
         for (r, input) in step.trunk.x(rows).chunks_exact_mut(trunk_inputs).enumerate() {
             let row = r * latent..(r + 1) * latent;
-            input[..latent].copy_from_slice(&x[row.clone()]);
-            if trunk_inputs > latent {
-                input[latent..].copy_from_slice(&x_g[row]);
+            let (state, rest) = input.split_at_mut(latent);
+            state.copy_from_slice(&x[row.clone()]);
+            if let Some((goal, rest)) = rest.split_at_mut_checked(latent) {
+                goal.copy_from_slice(&context.x_g[row]);
+                // One column, or none.
+                rest.fill(context.steps_left[r]);
             }
         }
         let features = &mut step.features[..rows * self.sizes.hidden];
@@ -319,7 +331,8 @@ impl<T: Element> PolicyDynamics<T> {
         let rows_of = hat.x.chunks_exact_mut(latent).zip(hat.x_g.chunks_exact_mut(latent));
         for ((x_hat, x_g_hat), row) in rows_of.zip(wide.chunks_exact(trunk_inputs)) {
             add(x_hat, &row[..latent]);
-            add(x_g_hat, &row[latent..]);
+            // Without the number of steps left, which does not depend on weights.
+            add(x_g_hat, &row[latent..trunk_inputs.min(2 * latent)]);
         }
     }
 }

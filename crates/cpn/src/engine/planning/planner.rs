@@ -53,6 +53,10 @@ impl Method for Planner {
         self.config.encoder.input() == input
     }
 
+    fn takes_steps_left(&self) -> bool {
+        self.config.method.takes_steps_left()
+    }
+
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         let encoder = &self.encoder;
         par_chunks(self.searcher.blocks_mut(), inputs, Chunks { least: 1, size: BLOCK }, |worker, inputs| {

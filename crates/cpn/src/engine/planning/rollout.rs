@@ -1,6 +1,6 @@
 //! Rollout of g_θ in the inner loop, with the inner loss and its gradient in the actions.
 
-use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics, StepTape};
+use crate::engine::networks::policy_dynamics::{Buffers, Context, PolicyDynamics, StepTape};
 use crate::engine::simd::element::Element;
 use crate::search::block::{Actions, Purpose};
 
@@ -25,12 +25,12 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// Rolls out along the actions, `[H, R, A]`: replaces x, `[R, Z]`, by x_H, and sets the goal error to x_g, `[R, Z]`. Proposed
-    /// actions are written to `actions`. For [`Purpose::Loss`] the steps share a tape, which stays in the caches.
+    /// Rolls out along the actions, `[H, R, A]`: replaces x, `[R, Z]`, by x_H, and sets the goal error to the context's
+    /// x_g. Proposed actions are written to `actions`. For [`Purpose::Loss`] the steps share a tape, which stays in the caches.
     pub fn forward(
         &mut self,
         network: &PolicyDynamics<T>,
-        (x, x_g): (&mut [T], &[T]),
+        (x, context): (&mut [T], Context<'_, T>),
         (source, actions): (Actions, &mut [T]),
         purpose: Purpose,
         buffers: &mut Buffers<T>,
@@ -40,7 +40,7 @@ impl<T: Element> Rollout<T> {
         for (t, action) in actions.chunks_mut(rows * network.sizes.actions).take(horizon).enumerate() {
             let step = &mut self.steps[if purpose == Purpose::Loss { 0 } else { t }];
             if t > 0 || source != Actions::Moved {
-                network.features(rows, step, x, x_g);
+                network.features(rows, step, x, context);
             }
             if source == Actions::Proposed {
                 network.policy(rows, step, action);
@@ -50,7 +50,7 @@ impl<T: Element> Rollout<T> {
             }
         }
 
-        for (error, (x, x_g)) in self.goal_error.iter_mut().zip(x.iter().zip(x_g)) {
+        for (error, (x, x_g)) in self.goal_error.iter_mut().zip(x.iter().zip(context.x_g)) {
             *error = *x - *x_g;
         }
     }

@@ -4,10 +4,11 @@ use super::rollout::Rollout;
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::networks::encoder::EncoderTape;
-use crate::engine::networks::policy_dynamics::{Buffers, PolicyDynamics};
+use crate::engine::networks::policy_dynamics::{Buffers, Context, PolicyDynamics};
 use crate::engine::simd::element::Element;
 use crate::search::Query;
 use crate::search::block::{Actions, PlanBlock, Purpose};
+use crate::steps_left;
 use std::sync::Arc;
 
 /// Maximum R, the number of plans in a block: more read the weights less often, and fewer keep the passes' intermediates in nearer
@@ -37,6 +38,8 @@ pub struct Worker<T: Element> {
     x: Vec<T>,
     /// `[R, Z]`.
     x_g: Vec<T>,
+    /// k, `[R]`.
+    steps_left: Vec<T>,
     /// Actions, `[H, R, A]`.
     actions: Vec<T>,
     /// Identity of the descent of the last rollout.
@@ -66,6 +69,7 @@ impl<T: Element> Worker<T> {
             buffers: dynamics.network.buffers(BLOCK),
             x: zeros(sizes.latent),
             x_g: zeros(sizes.latent),
+            steps_left: zeros(1),
             actions: zeros(dynamics.horizon * sizes.actions),
             resident: None,
             dynamics,
@@ -105,17 +109,18 @@ impl PlanBlock for Worker<f32> {
     }
 
     fn roll_out(&mut self, queries: &[Query<'_>], source: Actions, purpose: Purpose) -> Vec<f32> {
-        let Self { dynamics, rollout, buffers, x, x_g, actions, resident, .. } = self;
+        let Self { dynamics, rollout, buffers, x, x_g, steps_left, actions, resident, .. } = self;
         let (network, latent) = (&dynamics.network, dynamics.network.sizes.latent);
         *resident = None;
         for (r, query) in queries.iter().enumerate() {
             x[r * latent..][..latent].copy_from_slice(query.x);
             x_g[r * latent..][..latent].copy_from_slice(query.x_g);
+            steps_left[r] = steps_left::scaled(query.steps_left);
         }
 
         let rows = queries.len();
-        let ends = (&mut x[..rows * latent], &x_g[..rows * latent]);
-        rollout.forward(network, ends, (source, actions), purpose, buffers);
+        let context = Context { x_g: &x_g[..rows * latent], steps_left };
+        rollout.forward(network, (&mut x[..rows * latent], context), (source, actions), purpose, buffers);
         rollout.losses(network, rows).collect()
     }
 

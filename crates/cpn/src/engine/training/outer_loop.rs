@@ -4,7 +4,7 @@ use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::layers::passes::Order;
 use crate::engine::networks::policy_dynamics::{
-    Branches, Buffers, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
+    Branches, Buffers, Context, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes,
 };
 use crate::engine::planning::rollout::{Rollout, huber_grad};
 use crate::engine::simd::element::Element;
@@ -50,6 +50,8 @@ pub struct Samples<'a, T> {
     pub x: &'a [T],
     /// x_g, `[R, Z]`.
     pub x_g: &'a [T],
+    /// k, the scaled number of steps left, `[R]`.
+    pub steps_left: &'a [T],
     /// Demonstrated actions, `[R, H, A]`.
     pub actions: &'a [T],
     /// Mask, `[R, H]`: 1 for an action within the demonstration, else 0.
@@ -109,7 +111,13 @@ impl<'a, T: Element> Samples<'a, T> {
             let columns = values.len() / rows;
             &values[first * columns..(first + count) * columns]
         };
-        Self { x: cut(self.x), x_g: cut(self.x_g), actions: cut(self.actions), mask: cut(self.mask) }
+        Self {
+            x: cut(self.x),
+            x_g: cut(self.x_g),
+            steps_left: cut(self.steps_left),
+            actions: cut(self.actions),
+            mask: cut(self.mask),
+        }
     }
 }
 
@@ -239,7 +247,8 @@ impl<T: Element> BlockTapes<T> {
         x.copy_from_slice(samples.x);
         let source = if k == 0 { Actions::Proposed } else { Actions::Given };
         let purpose = if settings.updates > 0 { Purpose::Gradient } else { Purpose::Actions };
-        rollouts[k].forward(network, (x, samples.x_g), (source, actions), purpose, buffers);
+        let context = Context { x_g: samples.x_g, steps_left: samples.steps_left };
+        rollouts[k].forward(network, (x, context), (source, actions), purpose, buffers);
     }
 
     /// Update k of the actions: a gradient step on the inner loss.

@@ -7,6 +7,7 @@ use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::simd::vector::add;
 use crate::precision::Precision;
+use crate::steps_left;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -52,7 +53,8 @@ impl OuterLoss {
             rows.iter().flat_map(|row| &embeddings[row * latent..][..latent]).copied().collect()
         };
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
-        let samples = Samples { x: &x, x_g: &x_g, actions: &batch.actions, mask: &batch.mask };
+        let steps_left: Vec<f32> = batch.steps_left.iter().copied().map(steps_left::scaled).collect();
+        let samples = Samples { x: &x, x_g: &x_g, steps_left: &steps_left, actions: &batch.actions, mask: &batch.mask };
         let outer = self.outer_loop.run(weights, samples);
 
         // A frame's gradient is the sum over its samples, as observation or goal.
