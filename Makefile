@@ -70,11 +70,13 @@ $(EXPERIMENT)/.ready: experiments/leave_one_out/pyproject.toml experiments/leave
 	cd experiments/leave_one_out && $(UV) sync --quiet --locked
 	touch $@
 
-build: setup ## Compile the services
+build: setup ## Compile the services, optimised, into target/release
 	cargo build --release --locked
 
-demo: build ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
-	$(WORKER)/bin/python experiments/demo.py
+# Compiled as for `test`, so that a new machine compiles every crate once for both.
+demo: setup ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
+	cargo build --workspace --locked
+	CPN_PROGRAMS=$(CURDIR)/target/debug $(WORKER)/bin/python experiments/demo.py
 
 dataset: build ## Record 100 demonstrations of each of the 24 tasks, and check them (EPISODES=n for fewer)
 	$(WORKER)/bin/python experiments/dataset.py
