@@ -37,7 +37,7 @@ fn exchange(plan: u8) -> Exchange {
         model_digest: None,
         search: None,
         warm_start: vec![vec![0.5, -0.0]],
-        steps_left: Some(70 - u32::from(step)),
+        steps_left: Some(70 - step),
     };
     let response = PlanResponse {
         actions: vec![vec![1.5, -0.0], vec![0.0, f32::MIN_POSITIVE]],

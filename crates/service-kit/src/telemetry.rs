@@ -17,7 +17,7 @@ use tracing_subscriber::{EnvFilter, Layer};
 /// OpenTelemetry's environment variable with the endpoint for spans; tracing is off without it.
 const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 /// Targets whose spans are exported.
-const TRACED: [&str; 3] = ["planner", "evaluator", "wire"];
+const TRACED: [&str; 4] = ["evaluator", "planner", "service_kit", "wire"];
 
 /// Guard of the span exporter; sends pending spans when dropped.
 #[derive(Debug)]

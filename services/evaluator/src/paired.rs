@@ -172,8 +172,8 @@ mod tests {
         let z2 = normal_quantile().powi(2);
         assert!((high - z2 / (20.0 + z2)).abs() < 1e-9 && (low + high).abs() < 1e-9, "{low}, {high}");
         // Turned round with the arms, and within the limits.
-        let ((low, high), turned) = (tango(counts(1, 1, 7, 12)), tango(counts(1, 7, 1, 12)));
-        assert!((low + turned.1).abs() < 1e-9 && (high + turned.0).abs() < 1e-9);
+        let ((low, high), swapped) = (tango(counts(1, 1, 7, 12)), tango(counts(1, 7, 1, 12)));
+        assert!((low + swapped.1).abs() < 1e-9 && (high + swapped.0).abs() < 1e-9);
         let (low, high) = tango(counts(0, 8, 0, 0));
         assert!((low - (8.0 - z2) / (8.0 + z2)).abs() < 1e-9 && high == 1.0, "{low}, {high}");
     }

@@ -104,9 +104,9 @@ fn two_models_of_a_folder_are_compared_seed_by_seed() {
     assert!(row("reach").trim().ends_with("yes") && row("door-lock").trim().ends_with("no"));
     assert!(table.contains(&comparison.seeds_digest) && table.contains("run:cpn"));
 
-    // The other way round, everything is turned.
-    let turned = compare(&[of(&source, "bc")], &[of(&source, "cpn")]);
-    let (there, back) = (reach.interval, turned.tasks[1].interval);
+    // The other way round, all signs change.
+    let swapped = compare(&[of(&source, "bc")], &[of(&source, "cpn")]);
+    let (there, back) = (reach.interval, swapped.tasks[1].interval);
     assert!((there.0 + back.1).abs() < 1e-9 && (there.1 + back.0).abs() < 1e-9);
 }
 
