@@ -64,7 +64,7 @@ class Results:
 
     @property
     def trained(self) -> list[str]:
-        """Those of `methods` that were trained."""
+        """Trained methods, in the order of `methods`."""
         return [name for name in self.methods if any(cell["trained"] for cell in self.of(name))]
 
     def of(self, method: str) -> list[Cell]:

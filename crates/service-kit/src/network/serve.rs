@@ -72,7 +72,7 @@ impl<S: Send + Sync + 'static> Server<S> {
         self.serve_and_report(key, places, handle, |_, _| ()).await
     }
 
-    /// The same for requests that change the service's state; refusals are logged and counted under the change's name.
+    /// Form of [`Self::serve`] for changes of the service's state: refusals are logged and counted under the change's name.
     ///
     /// # Errors
     /// If zenoh refuses the declaration.
