@@ -5,8 +5,8 @@ use crate::encoder::Encoder;
 use crate::inner_loop::{InnerLoop, TensorPlan};
 use crate::loss::{self, TensorBatch};
 use crate::tensors;
-use cpn::{Model, ModelConfig};
-use tch::{Device, Tensor, nn};
+use cpn::{Losses, Model, ModelConfig};
+use tch::{Device, Reduction, Tensor, nn};
 
 /// A learned method: encoder, g_θ and the step size of its inner loop.
 #[derive(Debug)]
@@ -54,23 +54,48 @@ impl Agent {
 
     /// The outer loss of a batch, a scalar, differentiable in the weights through the inner loop's updates by autograd: the
     /// reference for [`OuterLoss`](cpn::engine::OuterLoss).
-    pub fn outer_loss(&self, batch: &TensorBatch) -> Tensor {
-        self.embedded_loss(&self.encoder.encode(&batch.frames), batch)
+    pub fn outer_loss(&self, batch: &TensorBatch, losses: Losses) -> Tensor {
+        self.embedded_loss(&self.encoder.encode(&batch.frames), batch, losses)
     }
 
     /// The outer loss of a batch with embedded frames, `[F, Z]`.
-    pub fn embedded_loss(&self, embeddings: &Tensor, batch: &TensorBatch) -> Tensor {
-        let (x, x_g) = (embeddings.index_select(0, &batch.observations), embeddings.index_select(0, &batch.goals));
-        let planned = self.plan_differentiably(&x, &x_g, &batch.steps_left);
-        loss::behaviour_cloning(&planned, &batch.actions, &batch.mask)
+    pub fn embedded_loss(&self, embeddings: &Tensor, batch: &TensorBatch, losses: Losses) -> Tensor {
+        let rows = |indices: &Tensor| embeddings.index_select(0, &indices.flatten(0, -1));
+        let (x, x_g) = (rows(&batch.observations), rows(&batch.goals));
+        let next = if losses.dynamics > 0.0 { Some(rows(&batch.next).detach()) } else { None };
+        let loss = self.loss_from(&x, &x_g, next.as_ref(), batch, losses);
+        if losses.position == 0.0 {
+            return loss;
+        }
+        let first = embeddings.narrow(1, 0, 3);
+        loss + first.mse_loss(&batch.positions.to_kind(first.kind()), Reduction::Mean) * losses.position
     }
 
-    /// Planned actions, `[B, H, A]`, from x to x_g, both `[B, Z]`, with their graph; `steps_left` is k, `[B]`.
-    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> Tensor {
+    /// The outer loss from x to x_g, both `[B, Z]`; `next`, `[B H, Z]`, are the embeddings after the demonstrated actions.
+    pub fn loss_from(
+        &self,
+        x: &Tensor,
+        x_g: &Tensor,
+        next: Option<&Tensor>,
+        batch: &TensorBatch,
+        losses: Losses,
+    ) -> Tensor {
+        let plans = self.plans_differentiably(x, x_g, &batch.steps_left);
+        let cloned = if losses.every_update { &plans[..] } else { &plans[plans.len() - 1..] };
+        let cloning = cloned.iter().map(|plan| loss::mean_squared(plan, &batch.actions, &batch.mask));
+        let cloning = cloning.sum::<Tensor>() / cloned.len() as f64;
+        let Some(next) = next else { return cloning };
+        let states = Tensor::stack(&self.inner_loop().states(x, x_g, &batch.actions), 1);
+        cloning + loss::mean_squared(&states, &next.view_as(&states), &batch.mask) * losses.dynamics
+    }
+
+    /// Planned actions before and after every update, `[B, H, A]` each, from x to x_g, both `[B, Z]`, with their graph;
+    /// `steps_left` is k, `[B]`.
+    fn plans_differentiably(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> Vec<Tensor> {
         if self.config.method.plans() {
-            self.inner_loop().plan_differentiably(x, x_g).actions
+            self.inner_loop().plans_differentiably(x, x_g)
         } else {
-            self.react(x, x_g, steps_left)
+            vec![self.react(x, x_g, steps_left)]
         }
     }
 

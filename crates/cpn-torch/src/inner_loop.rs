@@ -47,17 +47,26 @@ impl InnerLoop<'_> {
         TensorPlan { actions, inner_losses }
     }
 
-    /// The plans of [`Self::plan`] with the graph of all updates, for the outer loop.
-    pub fn plan_differentiably(&self, x: &Tensor, x_g: &Tensor) -> TensorPlan {
-        let mut actions = self.policy_rollout(x, x_g);
-        let mut inner_losses = Vec::new();
-        for _ in 0..self.updates {
-            let (loss, gradient) = self.loss_and_gradient(x, x_g, &actions, true);
-            inner_losses.push(loss.detach());
-            // Not `-=`, which would overwrite a tensor of the graph.
-            actions = &actions - self.step_size * gradient;
+    /// The plans of [`Self::plan`] before and after every update, `[B, H, A]` each, with the graph of all updates, for the outer
+    /// loop.
+    pub fn plans_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Vec<Tensor> {
+        let mut plans = vec![self.policy_rollout(x, x_g)];
+        for k in 0..self.updates as usize {
+            let (_, gradient) = self.loss_and_gradient(x, x_g, &plans[k], true);
+            plans.push(&plans[k] - self.step_size * gradient);
         }
-        TensorPlan { actions, inner_losses }
+        plans
+    }
+
+    /// Predicted states, `[B, Z]`, after each of the `actions`, `[B, H, A]`.
+    pub fn states(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Vec<Tensor> {
+        let mut x = x.shallow_clone();
+        let step = |action: &Tensor| {
+            let features = self.network.features(&x, x_g);
+            x = self.network.next(&x, &features, action);
+            x.shallow_clone()
+        };
+        actions.unbind(1).iter().map(step).collect()
     }
 
     /// The initial plan: the policy's actions, `[B, H, A]`, along the predicted states.
@@ -78,12 +87,9 @@ impl InnerLoop<'_> {
     /// Inner losses, `[B]`: Huber loss between the predicted state after `actions`, `[B, H, A]`, and the goal, summed over the
     /// latent.
     pub fn loss(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Tensor {
-        let mut x = x.shallow_clone();
-        for action in actions.unbind(1) {
-            let features = self.network.features(&x, x_g);
-            x = self.network.next(&x, &features, &action);
-        }
-        x.huber_loss(x_g, Reduction::None, HUBER_DELTA).sum_dim_intlist(1, false, None::<Kind>)
+        let states = self.states(x, x_g, actions);
+        let error = states[states.len() - 1].huber_loss(x_g, Reduction::None, HUBER_DELTA);
+        error.sum_dim_intlist(1, false, None::<Kind>)
     }
 
     /// Inner losses, `[B]`, and their gradient in the actions, `[B, H, A]`, itself differentiable with `create_graph`.

@@ -6,7 +6,7 @@ use crate::loss::TensorBatch;
 use crate::tensors;
 use cpn::archive::{self, Tensors};
 use cpn::learner::{Learner, LearnerError, StageTimes, Step};
-use cpn::{Batch, Model, Training};
+use cpn::{Batch, Losses, Model, Training};
 use std::collections::BTreeMap;
 use std::time::Instant;
 use tch::{Device, Tensor};
@@ -21,6 +21,7 @@ pub struct TorchLearner {
     agent: Agent,
     device: Device,
     threads: usize,
+    losses: Losses,
     max_gradient_norm: f64,
     /// The agent's weights by name, views of `values`.
     weights: BTreeMap<String, Tensor>,
@@ -51,8 +52,8 @@ impl TorchLearner {
         }
 
         let (mean, square) = (values.zeros_like(), values.zeros_like());
-        let max_gradient_norm = training.max_gradient_norm;
-        Self { agent, device, threads, max_gradient_norm, weights, values, mean, square, steps: 0 }
+        let &Training { losses, max_gradient_norm, .. } = training;
+        Self { agent, device, threads, losses, max_gradient_norm, weights, values, mean, square, steps: 0 }
     }
 
     /// The gradient of a loss in all weights, as one vector; 0 for weights that do not affect it.
@@ -92,7 +93,7 @@ impl TorchLearner {
         let batch = TensorBatch::new(batch, self.agent.config().horizon, self.device);
         let embeddings = self.agent.encoder().encode(&batch.frames);
         let encoded = Instant::now();
-        let loss_tensor = self.agent.embedded_loss(&embeddings, &batch);
+        let loss_tensor = self.agent.embedded_loss(&embeddings, &batch, self.losses);
         let loss = loss_tensor.double_value(&[]);
         if !loss.is_finite() {
             return Err(LearnerError::Loss(loss));

@@ -1,4 +1,4 @@
-//! Outer loss: behaviour cloning of the planned actions.
+//! Batches as tensors, and the error of the outer loss.
 
 use crate::tensors;
 use cpn::Batch;
@@ -19,6 +19,10 @@ pub struct TensorBatch {
     pub actions: Tensor,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Tensor,
+    /// Index among the frames of the frame after each action, `[B, H]` integers; empty without a dynamics loss.
+    pub next: Tensor,
+    /// Standardised position of the hand in each frame, `[F, 3]`; empty without a position loss.
+    pub positions: Tensor,
 }
 
 impl TensorBatch {
@@ -33,14 +37,16 @@ impl TensorBatch {
             steps_left: on_device(tensors::from_steps_left(batch.steps_left.iter().copied())),
             actions: on_device(Tensor::from_slice(&batch.actions).view([samples, horizon, -1])),
             mask: on_device(Tensor::from_slice(&batch.mask).view([samples, horizon])),
+            next: on_device(tensors::from_indices(&batch.next).view([-1, horizon])),
+            positions: on_device(Tensor::from_slice(batch.positions.as_flattened()).view([-1, 3])),
         }
     }
 }
 
-/// Mean squared error between planned and demonstrated actions, both `[B, H, A]`, over the steps within the demonstration, where
-/// `mask`, `[B, H]`, is 1; it is 0 past the end.
-pub fn behaviour_cloning(planned: &Tensor, demonstrated: &Tensor, mask: &Tensor) -> Tensor {
-    let actions = planned.size()[2] as f64;
-    let squared = (planned - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);
-    (squared * mask).sum(None::<Kind>) / (mask.sum(None::<Kind>) * actions)
+/// Mean squared error between planned and demonstrated actions, or predicted and later states, `[B, H, N]`, over the steps within the
+/// demonstration, where `mask`, `[B, H]`, is 1; it is 0 past the end.
+pub fn mean_squared(predicted: &Tensor, demonstrated: &Tensor, mask: &Tensor) -> Tensor {
+    let size = predicted.size()[2] as f64;
+    let squared = (predicted - demonstrated).square().sum_dim_intlist(2, false, None::<Kind>);
+    (squared * mask).sum(None::<Kind>) / (mask.sum(None::<Kind>) * size)
 }

@@ -17,4 +17,9 @@ pub struct Batch {
     pub actions: Vec<f32>,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Vec<f32>,
+    /// Index among the frames of the frame after each action within the demonstration, `[B, H]`, any past its end; empty without a
+    /// dynamics loss.
+    pub next: Vec<usize>,
+    /// Standardised position of the hand in each frame, `[F][3]`; empty without a position loss.
+    pub positions: Vec<[f32; 3]>,
 }

@@ -45,4 +45,4 @@ pub use learner::Learner;
 pub use method::{Frames, Method, Plan, Random};
 pub use model::Model;
 pub use precision::Precision;
-pub use recipe::{Preset, Recipe, Training};
+pub use recipe::{Losses, Preset, Recipe, Training};

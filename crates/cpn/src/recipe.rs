@@ -16,6 +16,21 @@ pub enum GoalSampling {
     Hindsight,
 }
 
+/// Losses of the outer loop beside behaviour cloning of the last plan. The default is the paper's: none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Losses {
+    /// True if the plans before and after every update are cloned, all with the same weight, so that every number of updates up to
+    /// the model's gives a policy.
+    pub every_update: bool,
+    /// Weight of the dynamics loss: the mean squared error between the states predicted under the demonstrated actions, after one to
+    /// H steps, and the embeddings of the frames that followed, which get no gradient from it.
+    pub dynamics: f64,
+    /// Weight of the position loss: the mean squared error between the first three elements of each frame's embedding and the
+    /// position of the hand, standardised over the demonstrations. Only training needs positions.
+    pub position: f64,
+}
+
 /// Training settings of the outer loop. With the model's configuration, the data and the seed they determine the weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -41,6 +56,9 @@ pub struct Training {
     pub max_gradient_norm: f64,
     /// Arithmetic precision of the encoder.
     pub precision: Precision,
+    /// Losses beside behaviour cloning of the last plan; none in checkpoints from before there were any.
+    #[serde(default)]
+    pub losses: Losses,
 }
 
 /// Configuration of a model and of its training. With the data and the seed it determines the weights.
@@ -154,6 +172,7 @@ impl Training {
             peak_learning_rate: 1.5e-3,
             max_gradient_norm: 10.0,
             precision: Precision::Float32,
+            losses: Losses::default(),
         }
     }
 
@@ -176,13 +195,16 @@ impl Training {
             }
         };
         number("training.colour_jitter", self.colour_jitter, 0.0..=0.5)?;
+        number("training.losses.dynamics", self.losses.dynamics, 0.0..=1e6)?;
+        number("training.losses.position", self.losses.position, 0.0..=1e6)?;
         number("training.peak_learning_rate", self.peak_learning_rate, 1e-9..=1.0)?;
         number("training.max_gradient_norm", self.max_gradient_norm, 1e-9..=1e9)
     }
 }
 
 impl Recipe {
-    /// Checks every value against its range. Augmentation is allowed only with images.
+    /// Checks every value against its range. Augmentation and the position loss are allowed only with images, losses of plans only
+    /// for methods that plan.
     ///
     /// # Errors
     /// The first field out of its range, with the range and the value.
@@ -192,6 +214,19 @@ impl Recipe {
             in_range("training.shift_pixels", self.training.shift_pixels.into(), 0, 0)?;
             if self.training.colour_jitter != 0.0 {
                 return Err(ConfigError::new("training.colour_jitter", self.training.colour_jitter, 0, 0));
+            }
+            if self.training.losses.position != 0.0 {
+                return Err(ConfigError::new("training.losses.position", self.training.losses.position, 0, 0));
+            }
+        }
+        if self.training.losses.position > 0.0 {
+            in_range("encoder.latent", self.model.encoder.latent(), 3, 512)?;
+        }
+        if !self.model.method.plans() {
+            let Losses { every_update, dynamics, .. } = self.training.losses;
+            in_range("training.losses.every_update", every_update.into(), 0, 0)?;
+            if dynamics != 0.0 {
+                return Err(ConfigError::new("training.losses.dynamics", dynamics, 0, 0));
             }
         }
         self.training.validate()

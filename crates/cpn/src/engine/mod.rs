@@ -21,7 +21,7 @@
 //!
 //! All passes of a block of samples are computed before the next block, so that its tapes stay in the processor's caches. The
 //! encoder f_φ is of the first order only: forward over all frames, and backward after their gradients are known
-//! ([`EncoderPass`]). Tested against autograd in float64 (`crates/cpn-torch/tests/gradients.rs`).
+//! ([`EncoderPass`]). Tested against autograd in float64 (`crates/cpn-torch/tests/it/gradients.rs`).
 
 pub(crate) mod gemm;
 pub(crate) mod layers;

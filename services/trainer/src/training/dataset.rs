@@ -20,6 +20,8 @@ pub struct Dataset {
     /// Actions in the order of the episodes, `[actions, A]`.
     actions: Vec<f32>,
     action_size: usize,
+    /// Standardised position of the hand in each frame; empty if a step has none.
+    hand_positions: Vec<[f32; 3]>,
     episodes: Vec<Episode>,
     infos: Vec<RecordedEpisode>,
     digest: String,
@@ -83,17 +85,19 @@ impl Dataset {
             }
         };
 
-        let action_size = read[0].1;
-        for ((_, got), path) in read.iter().zip(&paths) {
+        let action_size = read[0].action_size;
+        for (Steps { action_size: got, .. }, path) in read.iter().zip(&paths) {
             let path = path.display();
             ensure!(
                 action_size == *got,
                 "{path}: actions: expected {action_size} values like the episodes before, got {got}"
             );
         }
-        let actions = read.into_iter().flat_map(|(actions, _)| actions).collect();
+        let hand_positions: Option<Vec<_>> = read.iter().map(|steps| steps.hand_positions.as_deref()).collect();
+        let hand_positions = standardised(hand_positions.unwrap_or_default().concat());
+        let actions = read.into_iter().flat_map(|steps| steps.actions).collect();
         let digest = dataset_digest(&infos);
-        Ok(Self { frames, actions, action_size, episodes, infos, digest })
+        Ok(Self { frames, actions, action_size, hand_positions, episodes, infos, digest })
     }
 
     /// Names of the tasks, sorted.
@@ -134,10 +138,39 @@ impl Dataset {
         &self.frames
     }
 
+    /// Position of the hand in each frame, with mean 0 on each axis and standard deviation 1 over all axes; empty if a recorded step
+    /// has no state of at least three values.
+    pub fn hand_positions(&self) -> &[[f32; 3]] {
+        &self.hand_positions
+    }
+
     /// The `count` actions, `[count, A]`, from index `first` on.
     pub fn actions(&self, first: usize, count: usize) -> &[f32] {
         &self.actions[first * self.action_size..][..count * self.action_size]
     }
+}
+
+/// Actions and states of an episode's steps.
+struct Steps {
+    /// `[T, A]`.
+    actions: Vec<f32>,
+    /// A.
+    action_size: usize,
+    /// Position of the hand at each step, the first three values of its state.
+    hand_positions: Option<Vec<[f32; 3]>>,
+}
+
+/// Positions less their mean, over the standard deviation of all their coordinates.
+fn standardised(mut positions: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
+    let count = positions.len().max(1) as f64;
+    for axis in 0..3 {
+        let mean = positions.iter().map(|position| f64::from(position[axis])).sum::<f64>() / count;
+        positions.iter_mut().for_each(|position| position[axis] -= mean as f32);
+    }
+    let squares = positions.as_flattened().iter().map(|value| f64::from(*value).powi(2)).sum::<f64>();
+    let deviation = (squares / (3.0 * count)).sqrt().max(f64::from(f32::EPSILON)) as f32;
+    positions.as_flattened_mut().iter_mut().for_each(|value| *value /= deviation);
+    positions
 }
 
 fn header(path: &Path) -> anyhow::Result<RecordedEpisode> {
@@ -156,19 +189,20 @@ fn slots<'a, T>(mut frames: &'a mut [T], size: usize, episodes: &[Episode]) -> V
     episodes.iter().map(cut).collect()
 }
 
-/// Reads the episodes and copies their frames into their slots by `copy`; returns actions, `[T, A]`, and A of each.
+/// Reads the episodes and copies their frames into their slots by `copy`.
 fn fill<T: Send>(
     slots: Vec<&mut [T]>,
     folder: &Path,
     paths: &[PathBuf],
     copy: impl Fn(&Recording, &mut [T]) -> anyhow::Result<()> + Sync,
-) -> anyhow::Result<Vec<(Vec<f32>, usize)>> {
+) -> anyhow::Result<Vec<Steps>> {
     let read = |(slot, path): (&mut [T], &PathBuf)| {
         let episode = folder::read(folder, path)?;
         copy(&episode, slot).with_context(|| path.display().to_string())?;
         let actions: Vec<f32> = episode.steps().iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
-        let size = actions.len() / (episode.steps().len() - 1);
-        Ok((actions, size))
+        let action_size = actions.len() / (episode.steps().len() - 1);
+        let hand_positions = episode.steps().iter().map(|step| step.state.first_chunk().copied()).collect();
+        Ok(Steps { actions, action_size, hand_positions })
     };
     slots.into_par_iter().zip(paths).map(read).collect()
 }

@@ -66,6 +66,10 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
 
     let (expected, got) = (model.actions, dataset.action_size());
     ensure!(expected == got as i64, "model.actions: expected {got} as the demonstrations have, got {expected}");
+    ensure!(
+        training.losses.position == 0.0 || !dataset.hand_positions().is_empty(),
+        "training.losses.position: expected demonstrations whose states begin with the hand's position, got some without"
+    );
     let _keeper = files::take_over_file(&config.out).context("out")?;
 
     let tasks: Vec<String> = dataset.tasks().into_iter().map(str::to_owned).collect();

@@ -74,8 +74,15 @@ impl<'a> Sampler<'a> {
         let mut draws = Vec::new();
         for (index, episode) in self.dataset.episodes().iter().enumerate() {
             let mut steps: Vec<usize> = (0..episode.action_count).collect();
-            steps.shuffle(&mut rng);
-            draws.extend(steps.chunks(self.training.samples_per_draw).map(|steps| (index, steps.to_vec())));
+            let size = self.training.samples_per_draw;
+            if self.needs_next() {
+                // Successive samples share most of the frames after them. Segments begin elsewhere in each epoch.
+                let (first, rest) = steps.split_at(rng.random_range(0..size).min(steps.len()));
+                draws.extend([first].into_iter().chain(rest.chunks(size)).map(|steps| (index, steps.to_vec())));
+            } else {
+                steps.shuffle(&mut rng);
+                draws.extend(steps.chunks(size).map(|steps| (index, steps.to_vec())));
+            }
         }
         draws.shuffle(&mut rng);
 
@@ -104,6 +111,7 @@ impl<'a> Sampler<'a> {
         let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         let mut actions = vec![0.0; samples.len() * horizon * size];
         let mut mask = vec![0.0; samples.len() * horizon];
+        let mut next = Vec::new();
 
         for (row, sample) in samples.iter().enumerate() {
             observations.push(frames.row(sample.episode, sample.step));
@@ -115,10 +123,33 @@ impl<'a> Sampler<'a> {
                 if self.block(episode, sample, t, &mut actions[at * size..][..size]) {
                     mask[at] = 1.0;
                 }
+                if self.needs_next() {
+                    let step = sample.step as usize + (t + 1) * self.training.action_block;
+                    next.push(frames.row(sample.episode, sample.goal.min(step as u32)));
+                }
             }
         }
+        let positions = if self.training.losses.position > 0.0 {
+            frames.frames.iter().map(|&(_, index)| self.dataset.hand_positions()[index]).collect()
+        } else {
+            Vec::new()
+        };
         let steps_left = samples.iter().map(|sample| sample.goal - sample.step).collect();
-        Batch { frames: self.frames(step, &frames.frames), observations, goals, steps_left, actions, mask }
+        Batch {
+            frames: self.frames(step, &frames.frames),
+            observations,
+            goals,
+            steps_left,
+            actions,
+            mask,
+            next,
+            positions,
+        }
+    }
+
+    /// True if the frames after a sample's actions are in the batch.
+    fn needs_next(&self) -> bool {
+        self.training.losses.dynamics > 0.0
     }
 
     /// Frames by episode and index in the dataset; images are augmented.

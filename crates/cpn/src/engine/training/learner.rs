@@ -24,7 +24,7 @@ impl NativeLearner {
     pub fn new(model: Model, training: &Training, threads: usize) -> Self {
         Self {
             adam: Adam::new(&model.weights),
-            outer_loss: OuterLoss::new(&model.config, training.precision.where_faster(), threads),
+            outer_loss: OuterLoss::new(&model.config, training.losses, training.precision.where_faster(), threads),
             max_gradient_norm: training.max_gradient_norm,
             config: model.config,
         }

@@ -1,5 +1,7 @@
-//! Outer loop: behaviour cloning through the inner loop, with its gradient, for blocks of samples on several threads.
+//! Outer loop: behaviour cloning through the inner loop and the dynamics loss, with their gradient, for blocks of samples on
+//! several threads.
 
+use super::dynamics_loss::DynamicsLoss;
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::layers::passes::Order;
@@ -9,6 +11,7 @@ use crate::engine::networks::policy_dynamics::{
 use crate::engine::planning::rollout::{Rollout, huber_grad};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
+use crate::recipe::Losses;
 use crate::search::block::{Actions, Purpose};
 use rayon::prelude::*;
 
@@ -20,6 +23,7 @@ const BLOCK: usize = 32;
 #[derive(Debug)]
 pub struct OuterLoop<T> {
     config: ModelConfig,
+    losses: Losses,
     threads: Vec<ThreadState<T>>,
 }
 
@@ -56,6 +60,8 @@ pub struct Samples<'a, T> {
     pub actions: &'a [T],
     /// Mask, `[R, H]`: 1 for an action within the demonstration, else 0.
     pub mask: &'a [T],
+    /// Embeddings of the frames after the demonstrated actions, `[R, H, Z]`; empty without a dynamics loss.
+    pub next: &'a [T],
 }
 
 /// Settings of the inner loop and the loss.
@@ -67,8 +73,13 @@ struct Settings<T> {
     updates: usize,
     /// α, the step size of the inner loop.
     step_size: T,
-    /// Weight of a squared error: 1 / (A Σ mask), summed over the whole batch.
-    scale: T,
+    /// Weight of a squared error of an action in a cloned plan: 1 / (A Σ mask) over the number of cloned plans, with the sum over
+    /// the whole batch.
+    cloning: T,
+    /// True if the plans before the last update are cloned, too.
+    every_update: bool,
+    /// Weight of a squared error of a predicted state's element: that of the loss / (Z Σ mask).
+    dynamics: T,
 }
 
 /// Accumulated loss and gradients of a thread's samples.
@@ -93,6 +104,9 @@ struct BlockTapes<T> {
     /// Gradient of the outer loss in the actions, `[H, R, A]`.
     actions_hat: Vec<T>,
     actions_dot: Vec<T>,
+    /// Gradients of the cloning losses of the plans before the updates, `[H, R, A]` each.
+    cloning_hat: Vec<Vec<T>>,
+    dynamics: DynamicsLoss<T>,
     /// x along the rollout, then x̄, ẋ or x̂, `[R, Z]`.
     x: Vec<T>,
     x_hat: Vec<T>,
@@ -117,15 +131,16 @@ impl<'a, T: Element> Samples<'a, T> {
             steps_left: cut(self.steps_left),
             actions: cut(self.actions),
             mask: cut(self.mask),
+            next: cut(self.next),
         }
     }
 }
 
 impl<T: Element> OuterLoop<T> {
     /// An outer loop for models with a valid configuration, on `threads` threads, at least one.
-    pub fn new(config: ModelConfig, threads: usize) -> Self {
+    pub fn new(config: ModelConfig, losses: Losses, threads: usize) -> Self {
         let state = || ThreadState { tapes: None, accumulators: None };
-        Self { config, threads: (0..threads.max(1)).map(|_| state()).collect() }
+        Self { config, losses, threads: (0..threads.max(1)).map(|_| state()).collect() }
     }
 
     /// The outer loss of a batch and its gradient, deterministic for a given number of threads.
@@ -133,11 +148,14 @@ impl<T: Element> OuterLoop<T> {
         let network = PolicyDynamics::new(&self.config, weights);
         let (horizon, updates) = (self.config.horizon as usize, self.config.updates as usize);
         let count: T = samples.mask.iter().copied().sum();
+        let cloned_plans = if self.losses.every_update { updates + 1 } else { 1 };
         let settings = Settings {
             horizon,
             updates,
             step_size: weights.get("step_size")[0],
-            scale: T::ONE / (count * T::count(network.sizes.actions)),
+            cloning: T::ONE / (count * T::count(network.sizes.actions) * T::count(cloned_plans)),
+            every_update: self.losses.every_update,
+            dynamics: T::from_f64(self.losses.dynamics) / (count * T::count(network.sizes.latent)),
         };
 
         // Each thread computes its share of the samples in blocks.
@@ -199,6 +217,8 @@ impl<T: Element> BlockTapes<T> {
             actions: zeros(horizon * actions),
             actions_hat: zeros(horizon * actions),
             actions_dot: zeros(horizon * actions),
+            cloning_hat: (0..updates).map(|_| zeros(horizon * actions)).collect(),
+            dynamics: DynamicsLoss::new(network, rows, horizon),
             x: zeros(latent),
             x_hat: zeros(latent),
         }
@@ -222,21 +242,34 @@ impl<T: Element> BlockTapes<T> {
         for k in 0..self.rollouts.len() {
             self.roll_out(network, settings, samples, k);
             if settings.updates > 0 {
+                if settings.every_update {
+                    let (plan, hat) = (&self.actions, &mut self.cloning_hat[k]);
+                    accumulators.loss += behaviour_cloning_loss(network.sizes, settings, samples, plan, hat);
+                }
                 self.update(network, settings, rows, k);
             }
         }
-        accumulators.loss += self.behaviour_cloning_loss(network.sizes, settings, samples, rows);
+        let (plan, hat) = (&self.actions, &mut self.actions_hat);
+        accumulators.loss += behaviour_cloning_loss(network.sizes, settings, samples, plan, hat);
 
         // Backward through the updates and their rollouts.
         for k in (0..self.rollouts.len()).rev() {
             if settings.updates > 0 {
                 accumulators.step_size -= self.step_size_hat(network.sizes, rows, k);
                 self.begin_update_backward(network, settings, rows, k, x_g_hat);
+                if settings.every_update {
+                    add(&mut self.actions_hat, &self.cloning_hat[k]);
+                }
             } else {
                 self.x_hat[..x_hat.len()].fill(T::ZERO);
             }
             self.rollout_backward(network, settings, rows, k, x_g_hat, &mut accumulators.network);
             add(x_hat, &self.x_hat[..x_hat.len()]);
+        }
+
+        if !samples.next.is_empty() {
+            accumulators.loss +=
+                self.dynamics.run(network, settings.dynamics, samples, (x_hat, x_g_hat), &mut accumulators.network);
         }
     }
 
@@ -259,29 +292,6 @@ impl<T: Element> BlockTapes<T> {
         for (action, gradient) in actions.iter_mut().zip(&rollouts[k].gradient[..size]) {
             *action -= settings.step_size * *gradient;
         }
-    }
-
-    /// The outer loss, the mean squared error of the planned actions; writes its gradient in them to `actions_hat`.
-    fn behaviour_cloning_loss(
-        &mut self,
-        sizes: Sizes,
-        settings: Settings<T>,
-        samples: Samples<'_, T>,
-        rows: usize,
-    ) -> T {
-        let mut loss = T::ZERO;
-        for t in 0..settings.horizon {
-            for r in 0..rows {
-                let (at, demonstrated) = ((t * rows + r) * sizes.actions, (r * settings.horizon + t) * sizes.actions);
-                let scale = samples.mask[r * settings.horizon + t] * settings.scale;
-                for i in 0..sizes.actions {
-                    let error = self.actions[at + i] - samples.actions[demonstrated + i];
-                    loss += scale * error * error;
-                    self.actions_hat[at + i] = (scale + scale) * error;
-                }
-            }
-        }
-        loss
     }
 
     /// The negative derivative of the outer loss in α of update k: Σ â ∂L/∂a, with the inner loss L.
@@ -357,4 +367,28 @@ impl<T> Settings<T> {
     fn is_state_needed(&self, t: usize) -> bool {
         self.updates > 0 || t + 1 < self.horizon
     }
+}
+
+/// The loss of a cloned plan, `[H, R, A]`, the mean squared error of its actions; writes its gradient in them to `hat`.
+fn behaviour_cloning_loss<T: Element>(
+    sizes: Sizes,
+    settings: Settings<T>,
+    samples: Samples<'_, T>,
+    plan: &[T],
+    hat: &mut [T],
+) -> T {
+    let (horizon, rows) = (settings.horizon, samples.rows(sizes.latent));
+    let mut loss = T::ZERO;
+    for t in 0..horizon {
+        for r in 0..rows {
+            let (at, demonstrated) = ((t * rows + r) * sizes.actions, (r * horizon + t) * sizes.actions);
+            let scale = samples.mask[r * horizon + t] * settings.cloning;
+            for i in 0..sizes.actions {
+                let error = plan[at + i] - samples.actions[demonstrated + i];
+                loss += scale * error * error;
+                hat[at + i] = (scale + scale) * error;
+            }
+        }
+    }
+    loss
 }

@@ -7,6 +7,7 @@ use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::simd::vector::add;
 use crate::precision::Precision;
+use crate::recipe::Losses;
 use crate::steps_left;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -27,17 +28,19 @@ pub struct Gradient {
 pub struct OuterLoss {
     /// Z, the size of an embedding.
     latent: usize,
+    losses: Losses,
     encoder_pass: EncoderPass<f32>,
     outer_loop: OuterLoop<f32>,
 }
 
 impl OuterLoss {
     /// Outer losses of models with a valid configuration, with images embedded in `precision`, on `threads` threads, at least one.
-    pub fn new(config: &ModelConfig, precision: Precision, threads: usize) -> Self {
+    pub fn new(config: &ModelConfig, losses: Losses, precision: Precision, threads: usize) -> Self {
         Self {
             latent: config.encoder.latent() as usize,
+            losses,
             encoder_pass: EncoderPass::new(config.encoder.clone(), precision, threads),
-            outer_loop: OuterLoop::new(config.clone(), threads),
+            outer_loop: OuterLoop::new(config.clone(), losses, threads),
         }
     }
 
@@ -54,7 +57,15 @@ impl OuterLoss {
         };
         let (x, x_g) = (gather(&batch.observations), gather(&batch.goals));
         let steps_left: Vec<f32> = batch.steps_left.iter().copied().map(steps_left::scaled).collect();
-        let samples = Samples { x: &x, x_g: &x_g, steps_left: &steps_left, actions: &batch.actions, mask: &batch.mask };
+        let next = gather(&batch.next);
+        let samples = Samples {
+            x: &x,
+            x_g: &x_g,
+            steps_left: &steps_left,
+            actions: &batch.actions,
+            mask: &batch.mask,
+            next: &next,
+        };
         let outer = self.outer_loop.run(weights, samples);
 
         // A frame's gradient is the sum over its samples, as observation or goal.
@@ -65,10 +76,21 @@ impl OuterLoss {
             }
         }
 
+        // The position loss of each frame.
+        let mut position_loss = 0.0;
+        let scale = self.losses.position as f32 / (3 * batch.positions.len()).max(1) as f32;
+        for (row, position) in batch.positions.iter().enumerate() {
+            for (i, position) in position.iter().enumerate() {
+                let error = embeddings[row * latent + i] - position;
+                position_loss += scale * error * error;
+                hat[row * latent + i] += 2.0 * scale * error;
+            }
+        }
+
         let started = Instant::now();
         let in_encoder = embedded.vjp(&hat);
         Gradient {
-            loss: outer.loss.into(),
+            loss: (outer.loss + position_loss).into(),
             weights: outer.weights.into_iter().chain(in_encoder).collect(),
             encoder_seconds: (encoding + started.elapsed()).as_secs_f64(),
         }
