@@ -124,19 +124,19 @@ test: setup ## Everything that must pass
 	cd sim-worker && $(UV) run --quiet pytest
 
 test-crash: setup ## Kill the recorder a hundred times
-	cargo test --workspace --locked --test crash -- --ignored
+	cargo test --workspace --locked --test it -- --ignored crash::
 
 test-swap: setup ## Swap checkpoints a thousand times under a steady load of plans
-	cargo test --workspace --locked --test swap -- --ignored --nocapture
+	cargo test --workspace --locked --test it -- --ignored --nocapture swap::
 
 test-soak: setup ## Half an hour of everything at once against one planner: nothing fails, no memory grows
-	cargo test --workspace --locked --test soak -- --ignored --nocapture
+	cargo test --workspace --locked --test it -- --ignored --nocapture soak::
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
-	cargo test --workspace --locked --test openpi
+	cargo test --workspace --locked --test it -- openpi::
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 

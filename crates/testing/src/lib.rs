@@ -1,5 +1,9 @@
-//! Small models and inputs for tests.
+//! Small models, inputs, signatures and processes for tests.
 
+pub mod process;
+pub mod signatures;
+
+use cpn::checkpoint::Provenance;
 use cpn::config::{ConvConfig, ImageEncoderConfig, PositionEncoderConfig};
 use cpn::{EncoderConfig, MethodKind, ModelConfig, images};
 use proptest::prelude::*;
@@ -24,6 +28,17 @@ pub fn position_config(method: MethodKind) -> ModelConfig {
     let (centre_mm, scale_mm, layers) = ([500, 0, -200], 400, vec![7, 5]);
     let encoder = PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 6, layer_norm: true };
     ModelConfig { encoder: EncoderConfig::Position(encoder), actions: 3, ..small_config(method) }
+}
+
+/// Provenance without a render spec, of the paper's settings of training.
+pub fn provenance(training_tasks: &[&str], seed: u64) -> Provenance {
+    Provenance {
+        training_tasks: training_tasks.iter().map(ToString::to_string).collect(),
+        data_digest: "d".repeat(64),
+        render_spec: String::new(),
+        seed,
+        training: cpn::Training::paper(),
+    }
 }
 
 /// Bytes of `count` random images, RGB8.

@@ -5,8 +5,8 @@
 
 #![expect(clippy::unwrap_used, reason = "a bench")]
 
-#[path = "../tests/common/mod.rs"]
-mod common;
+#[path = "../tests/it/common/episodes.rs"]
+mod episodes;
 
 use clap::Parser;
 use cpn::archive::{self, Tensor, Tensors};
@@ -95,7 +95,7 @@ fn write(path: &Path, args: &Args) {
     let recipe = recipe(args);
     let folder = recordings(path);
     for seed in 0..EPISODES {
-        common::keep(&folder, &common::episode("noise", seed, STEPS));
+        episodes::keep(&folder, &episodes::episode("noise", seed, STEPS));
     }
     let dataset = Dataset::load(&folder, &[], Input::Image).unwrap();
 

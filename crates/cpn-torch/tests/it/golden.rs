@@ -1,11 +1,8 @@
 //! The method against golden tensors of an independent PyTorch implementation, `tests/golden/reference.py`.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use cpn::ModelConfig;
+use crate::common;
 use cpn::archive::{self, Tensors};
+use cpn::{Losses, ModelConfig};
 use cpn_torch::{Agent, tensors};
 use std::collections::BTreeMap;
 use tch::{Kind, Tensor};
@@ -41,7 +38,7 @@ fn check(method: &str) {
 
     let mask = golden["mask"].to_kind(Kind::Double);
     let batch = common::paired(&golden["observations"], &golden["goals"], &golden["demonstrated"], &mask);
-    let loss = agent.outer_loss(&batch);
+    let loss = agent.outer_loss(&batch, Losses::default());
     assert_close("outer_loss", &loss, &golden["outer_loss"]);
     loss.backward();
     for (name, variable) in agent.variables().variables() {

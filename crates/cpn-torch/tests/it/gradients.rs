@@ -1,14 +1,10 @@
 //! Hand-derived gradients of the outer loop and of the encoder against autograd, in float64.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{new_agent, steps_left, uniform};
+use crate::common::{new_agent, paired, steps_left, uniform};
 use cpn::config::ConvConfig;
 use cpn::engine::{EncoderPass, OuterLoop, Samples, Weights};
-use cpn::{EncoderConfig, Frames, Input, MethodKind, ModelConfig, Precision};
-use cpn_torch::{loss, tensors};
+use cpn::{EncoderConfig, Frames, Input, Losses, MethodKind, ModelConfig, Precision};
+use cpn_torch::tensors;
 use proptest::prelude::*;
 use std::collections::HashMap;
 use tch::{Kind, Tensor};
@@ -26,7 +22,7 @@ fn floats(tensor: &Tensor) -> Vec<f64> {
     Vec::try_from(tensor.to_kind(Kind::Double).flatten(0, -1)).unwrap()
 }
 
-fn check(config: ModelConfig, rows: i64, threads: usize) {
+fn check(config: ModelConfig, losses: Losses, rows: i64, threads: usize) {
     let agent = new_agent(config.clone());
     let latent = config.encoder.latent();
     let scale = 2.0;
@@ -35,14 +31,17 @@ fn check(config: ModelConfig, rows: i64, threads: usize) {
     let demonstrated = uniform(&[rows, config.horizon, config.actions], 3);
     let mask = uniform(&[rows, config.horizon], 4).gt(-0.6).to_kind(Kind::Double);
 
-    let planned = agent.plan_differentiably(&x, &x_g, &steps_left(rows));
-    let reference = loss::behaviour_cloning(&planned, &demonstrated, &mask);
+    let next = uniform(&[rows * config.horizon, latent], 5);
+    let batch = paired(&x, &x_g, &demonstrated, &mask);
+    let next = (losses.dynamics > 0.0).then_some(&next);
+    let reference = agent.loss_from(&x, &x_g, next, &batch, losses);
     reference.backward();
 
     let variables = Named(agent.variables().variables());
     let [xs, x_gs, ks, actions, masks] = [&x, &x_g, &steps_left(rows), &demonstrated, &mask].map(floats);
-    let samples = Samples { x: &xs, x_g: &x_gs, steps_left: &ks, actions: &actions, mask: &masks };
-    let ours = OuterLoop::new(config.clone(), threads).run(&variables, samples);
+    let next = next.map(floats).unwrap_or_default();
+    let samples = Samples { x: &xs, x_g: &x_gs, steps_left: &ks, actions: &actions, mask: &masks, next: &next };
+    let ours = OuterLoop::new(config.clone(), losses, threads).run(&variables, samples);
     let Named(variables) = variables;
 
     let close = |name: &str, ours: &[f64], reference: &Tensor| assert_close(&config, name, ours, reference);
@@ -81,7 +80,21 @@ fn agrees_with_autograd() {
                 continue;
             }
             for (rows, threads) in [(1, 1), (70, 1), (70, 3)] {
-                check(ModelConfig { horizon, updates, ..small_config(method) }, rows, threads);
+                check(ModelConfig { horizon, updates, ..small_config(method) }, Losses::default(), rows, threads);
+            }
+        }
+    }
+}
+
+#[test]
+fn losses_of_every_update_and_of_the_dynamics_agree_with_autograd() {
+    for method in [MethodKind::Upn, MethodKind::Cpn] {
+        for (horizon, updates) in [(1, 1), (5, 1), (4, 0), (3, 2)] {
+            for losses in [(true, 0.0), (false, 0.7), (true, 3.0)] {
+                let losses = Losses { every_update: losses.0, dynamics: losses.1, position: 0.0 };
+                for (rows, threads) in [(1, 1), (70, 3)] {
+                    check(ModelConfig { horizon, updates, ..small_config(method) }, losses, rows, threads);
+                }
             }
         }
     }
@@ -90,7 +103,7 @@ fn agrees_with_autograd() {
 /// At the paper's size a gate has several ranges; with 33 outputs the last one is smaller.
 #[test]
 fn gates_of_several_ranges_agree_with_autograd() {
-    check(ModelConfig { horizon: 2, hidden: 33, ..ModelConfig::paper(MethodKind::Cpn) }, 20, 1);
+    check(ModelConfig { horizon: 2, hidden: 33, ..ModelConfig::paper(MethodKind::Cpn) }, Losses::default(), 20, 1);
 }
 
 /// Checks embeddings, and the gradient of a loss that is linear in them.

@@ -1,11 +1,9 @@
 //! Training steps of all engines against those of autograd with libtorch's own optimiser.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use cpn::archive::Tensors;
 use cpn::engine::Native;
 use cpn::learner::LearnerError;
-use cpn::{Batch, Engine, Frames, Learner, MethodKind, Model, ModelConfig, Training};
+use cpn::{Batch, Engine, Frames, Learner, Losses, MethodKind, Model, ModelConfig, Training};
 use cpn_torch::loss::TensorBatch;
 use cpn_torch::{Agent, Torch, tensors};
 use tch::nn::OptimizerConfig;
@@ -45,11 +43,16 @@ fn batch(config: &ModelConfig, seed: u64) -> Batch {
         steps_left: vec![3, 2, 1, 40, 60, 200],
         actions: floats(samples * config.actions as usize, seed + 1).collect(),
         mask: floats(samples, seed + 2).map(|value| f32::from(value > -0.6)).collect(),
+        next: if config.method.plans() { (0..samples).map(|i| i % 4).collect() } else { Vec::new() },
+        positions: vec![[0.5, -1.0, 1.5]; 4],
     }
 }
 
-fn training() -> Training {
-    Training { max_gradient_norm: 1.0, ..Training::paper() }
+/// Settings with all losses that the model has.
+fn training(config: &ModelConfig) -> Training {
+    let plans = config.method.plans();
+    let losses = Losses { every_update: plans, dynamics: if plans { 0.5 } else { 0.0 }, position: 0.2 };
+    Training { max_gradient_norm: 1.0, losses, ..Training::paper() }
 }
 
 /// Name of a weight that differs from the expected one by more than a tenth of a step.
@@ -69,7 +72,8 @@ fn by_libtorch(model: &Model) -> Tensors {
     let mut adam = nn::Adam::default().build(agent.variables(), RATE).unwrap();
     for step in 0..STEPS {
         let batch = TensorBatch::new(&batch(&model.config, step as u64), model.config.horizon, Device::Cpu);
-        adam.backward_step_clip_norm(&agent.outer_loss(&batch), training().max_gradient_norm);
+        let Training { losses, max_gradient_norm, .. } = training(&model.config);
+        adam.backward_step_clip_norm(&agent.outer_loss(&batch, losses), max_gradient_norm);
     }
     agent.variables().variables().iter().map(|(name, weight)| (name.clone(), tensors::to_archive(weight))).collect()
 }
@@ -91,7 +95,7 @@ fn learners_agree_with_libtorchs_optimiser() {
         let expected = by_libtorch(&model);
         assert!(differing(&model.weights, &expected).is_some(), "weights move");
         for engine in engines() {
-            let mut learner = engine.learner(model.clone(), &training()).unwrap();
+            let mut learner = engine.learner(model.clone(), &training(&model.config)).unwrap();
             train(&mut *learner, 0..STEPS);
             assert_eq!(differing(&learner.model().weights, &expected), None, "{engine:?} {:?}", model.config);
         }
@@ -102,7 +106,7 @@ fn learners_agree_with_libtorchs_optimiser() {
 #[test]
 fn training_continues_from_a_restored_state() {
     let model = Model::new(small_config(MethodKind::Cpn), 3);
-    let learner = |engine: &dyn Engine| engine.learner(model.clone(), &training()).unwrap();
+    let learner = |engine: &dyn Engine| engine.learner(model.clone(), &training(&model.config)).unwrap();
     for engine in engines() {
         let (mut whole, mut first) = (learner(&*engine), learner(&*engine));
         train(&mut *whole, 0..STEPS);
@@ -124,7 +128,10 @@ fn training_continues_from_a_restored_state() {
 #[test]
 fn a_state_that_does_not_fit_is_refused() {
     for engine in engines() {
-        let learner = |method| engine.learner(Model::new(small_config(method), 3), &training()).unwrap();
+        let learner = |method| {
+            let config = small_config(method);
+            engine.learner(Model::new(config.clone(), 3), &training(&config)).unwrap()
+        };
         let mut state = learner(MethodKind::Cpn).state();
         state.remove("mean.step_size");
         let error = learner(MethodKind::Cpn).restore(&state, 1).unwrap_err().to_string();
@@ -136,7 +143,7 @@ fn a_state_that_does_not_fit_is_refused() {
 fn a_loss_that_is_not_finite_is_refused() {
     for engine in engines() {
         let model = Model::new(small_config(MethodKind::Bc), 3);
-        let mut learner = engine.learner(model.clone(), &training()).unwrap();
+        let mut learner = engine.learner(model.clone(), &training(&model.config)).unwrap();
         let mut batch = batch(&model.config, 0);
         batch.actions[0] = f32::NAN;
         batch.mask[0] = 1.0;

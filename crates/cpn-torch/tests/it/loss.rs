@@ -2,14 +2,14 @@
 
 use cpn::archive::Tensor as Archived;
 use cpn::engine::OuterLoss;
-use cpn::{Batch, Frames, MethodKind, Model, ModelConfig, Precision};
+use cpn::{Batch, Frames, Losses, MethodKind, Model, ModelConfig, Precision};
 use cpn_torch::Agent;
 use cpn_torch::loss::TensorBatch;
 use tch::{Device, Tensor};
 use testing::{noise_images, uniform};
 
 /// Eight samples of seven frames; some frames are both observation and goal, some are used repeatedly.
-fn batch(config: &ModelConfig) -> Batch {
+fn batch(config: &ModelConfig, losses: Losses) -> Batch {
     let samples = 8 * config.horizon as usize;
     let floats = |count, seed| uniform(count, seed).into_iter().map(|value| value as f32);
     Batch {
@@ -19,6 +19,8 @@ fn batch(config: &ModelConfig) -> Batch {
         steps_left: vec![90, 75, 60, 45, 30, 15, 1, 200],
         actions: floats(samples * config.actions as usize, 3).collect(),
         mask: floats(samples, 4).map(|value| f32::from(value > -0.6)).collect(),
+        next: if losses.dynamics > 0.0 { (0..samples).map(|i| i % 7).collect() } else { Vec::new() },
+        positions: if losses.position > 0.0 { vec![[0.5, -1.0, 1.5]; 7] } else { Vec::new() },
     }
 }
 
@@ -30,12 +32,12 @@ fn model(method: MethodKind) -> Model {
 }
 
 /// Relative differences from autograd, of the loss and of each weight's gradient by its norm.
-fn distances(method: MethodKind, precision: Precision) -> Vec<(String, f64)> {
+fn distances(method: MethodKind, losses: Losses, precision: Precision) -> Vec<(String, f64)> {
     let model = model(method);
     let agent = Agent::new(&model, Device::Cpu);
-    let batch = batch(&model.config);
-    let ours = OuterLoss::new(&model.config, precision, 1).differentiate(&model.weights, &batch);
-    let reference = agent.outer_loss(&TensorBatch::new(&batch, model.config.horizon, Device::Cpu));
+    let batch = batch(&model.config, losses);
+    let ours = OuterLoss::new(&model.config, losses, precision, 1).differentiate(&model.weights, &batch);
+    let reference = agent.outer_loss(&TensorBatch::new(&batch, model.config.horizon, Device::Cpu), losses);
     reference.backward();
     let expected = reference.double_value(&[]);
     let mut distances = vec![("loss".to_owned(), (ours.loss - expected).abs() / expected)];
@@ -52,11 +54,19 @@ fn distances(method: MethodKind, precision: Precision) -> Vec<(String, f64)> {
     distances
 }
 
+/// No loss but behaviour cloning, and all that a method has.
+fn losses(method: MethodKind) -> [Losses; 2] {
+    let all = Losses { every_update: method.plans(), dynamics: if method.plans() { 0.5 } else { 0.0 }, position: 0.2 };
+    [Losses::default(), all]
+}
+
 #[test]
 fn float32_agrees_with_autograd() {
     for method in MethodKind::ALL {
-        for (name, distance) in distances(method, Precision::Float32) {
-            assert!(distance < 2e-4, "{method} {name}: {distance}");
+        for losses in losses(method) {
+            for (name, distance) in distances(method, losses, Precision::Float32) {
+                assert!(distance < 2e-4, "{method} {losses:?} {name}: {distance}");
+            }
         }
     }
 }
@@ -65,7 +75,7 @@ fn float32_agrees_with_autograd() {
 #[test]
 fn bfloat16_is_close_to_autograd() {
     for method in MethodKind::ALL {
-        let distances = distances(method, Precision::Bfloat16);
+        let distances = distances(method, Losses::default(), Precision::Bfloat16);
         for (name, distance) in &distances {
             assert!(*distance < 0.33, "{method} {name}: {distance}");
         }
@@ -77,9 +87,11 @@ fn bfloat16_is_close_to_autograd() {
 #[test]
 fn gradients_are_reproducible() {
     let model = Model::new(ModelConfig::paper(MethodKind::Cpn), 3);
-    let batch = batch(&model.config);
-    let differentiate =
-        |threads| OuterLoss::new(&model.config, Precision::Float32, threads).differentiate(&model.weights, &batch);
+    let losses = losses(MethodKind::Cpn)[1];
+    let batch = batch(&model.config, losses);
+    let differentiate = |threads| {
+        OuterLoss::new(&model.config, losses, Precision::Float32, threads).differentiate(&model.weights, &batch)
+    };
     let (first, again, threaded) = (differentiate(1), differentiate(1), differentiate(3));
     assert_eq!(first.weights, again.weights);
     assert!((first.loss - threaded.loss).abs() < 1e-5 * first.loss);

@@ -1,10 +1,6 @@
 //! Plans of all engines against the reference by autograd, and properties of searches.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{double_agent, uniform};
+use crate::common::{double_agent, uniform};
 use cpn::archive::Tensor as Archived;
 use cpn::engine::Native;
 use cpn::images;

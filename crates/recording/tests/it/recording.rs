@@ -1,7 +1,5 @@
 //! Round trip of recordings, and refusals of damaged ones.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use foxglove::messages::RawImage;
 use mcap::records::{MessageHeader, op};
 use mcap::{MessageStream, WriteOptions, Writer};

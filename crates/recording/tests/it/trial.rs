@@ -1,7 +1,5 @@
 //! Round trip of a trial's recording, and refusals of other files.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use mcap::MessageStream;
 use recording::trial::{Exchange, Frame, Recording, from_bytes, to_bytes};
 use std::time::Duration;

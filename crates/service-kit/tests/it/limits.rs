@@ -1,7 +1,5 @@
 //! `docs/limits.md` against the code: every row cites its source verbatim, and no bound of messages and services is missing.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

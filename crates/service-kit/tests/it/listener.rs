@@ -1,7 +1,5 @@
 //! Listener against silent clients, too many clients, and a lack of file descriptors.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
 use metrics_exporter_prometheus::PrometheusBuilder;
 use service_kit::listener::{ListenConfig, Listener};
 use std::fs::File;

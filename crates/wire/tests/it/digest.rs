@@ -1,7 +1,5 @@
 //! Digests: agreement with the Python package, and sensitivity to every part.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use wire::Image;
 use wire::demonstration::{DemonstrationStep, digest};
 

@@ -1,7 +1,5 @@
 //! Keys against `tests/golden/keys.json`, which the Python package is tested against too.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use serde_json::Value;
 use std::collections::BTreeMap;
 use wire::key;

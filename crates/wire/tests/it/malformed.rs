@@ -1,7 +1,5 @@
 //! Refusals of invalid messages name the field at fault, what was expected and what came.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use prost::Message as _;
 use wire::checkpoint::CheckpointAnnouncement;
 use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep};

@@ -1,7 +1,5 @@
 //! Round trip of every message through its encoding, and decoders on arbitrary bytes.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;

@@ -1,10 +1,6 @@
 //! Every role at every endpoint, through a router with the generated configuration.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::Network;
+use crate::common::Network;
 use futures::future::join_all;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};

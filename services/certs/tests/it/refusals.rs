@@ -1,11 +1,7 @@
 //! Refusals of clients without a valid certificate.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
+use crate::common::{Network, authority, config};
 use certs::Authority;
-use common::{Network, authority, config};
 use service_kit::SessionConfig;
 use std::collections::BTreeSet;
 use std::os::unix::fs::PermissionsExt;

@@ -3,11 +3,7 @@
 //! Needs the simulator worker: `sim-worker/.venv/bin/cpn-sim-worker`, which `make setup` installs, or the command in
 //! `CPN_SIM_WORKER`.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{Ended, LIMIT, Lab};
+use crate::common::{Ended, LIMIT, Lab};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;

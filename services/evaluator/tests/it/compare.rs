@@ -1,7 +1,5 @@
 //! Comparisons are made from the records alone.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use evaluator::{Comparison, Counts, Episode, FORMAT, Folder, GoalSource, Model, Outcome, Planning, Run, Source};
 use evaluator::{StageTimes, Trial};
 use std::path::Path;

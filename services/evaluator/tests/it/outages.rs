@@ -1,10 +1,6 @@
 //! Evaluations through a router, planners and workers that come and go.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{Ended, LIMIT};
+use crate::common::{self, Ended, LIMIT};
 use planner::Planner;
 use recording::trial;
 use service_kit::SessionConfig;

@@ -1,10 +1,6 @@
 //! Episodes that an evaluation recorded are played back through planners, and so are files that are not right.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{LIMIT, Lab};
+use crate::common::{LIMIT, Lab};
 use recording::trial::{self, Exchange, Recording};
 use service_kit::SessionConfig;
 use std::path::PathBuf;

@@ -1,7 +1,5 @@
 //! The report is made from the records alone.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
 use evaluator::{Episode, FORMAT, Folder, GoalSource, Model, Outcome, Planning, Run, StageTimes, Trial};
 use recording::trial::{Frame, Recording};
 use std::time::Duration;

@@ -1,7 +1,5 @@
 //! Layers of the configuration.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
 use planner::Config;
 use planner::config::Args;
 use service_kit::config;

@@ -1,11 +1,7 @@
 //! Contract of all transports: the same request gets the same answer.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{
-    Client, Fixture, checkpoint, checkpoint_for, from_bytes, from_file, image, plan_request, position_checkpoint,
+use crate::common::{
+    self, Client, Fixture, checkpoint, checkpoint_for, from_bytes, from_file, image, plan_request, position_checkpoint,
     position_request, timeless,
 };
 use cpn::MethodKind;

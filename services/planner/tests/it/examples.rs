@@ -1,9 +1,6 @@
 //! Examples: README quotes one verbatim and links the others, and they run.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
+use crate::common;
 use std::path::Path;
 use std::process::Command;
 

@@ -1,10 +1,6 @@
 //! Start, health, reflection, drain.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Fixture, Gate, checkpoint, is, plan_request, soon};
+use crate::common::{self, Fixture, Gate, checkpoint, is, plan_request, soon};
 use cpn::MethodKind;
 use planner::Config;
 use planner::model::RANDOM;

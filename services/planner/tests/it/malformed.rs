@@ -1,10 +1,6 @@
 //! Malformed requests are refused as the client's fault, and the next one is answered.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Client, Fixture, NAME, plan_request, raw_query};
+use crate::common::{self, Client, Fixture, NAME, plan_request, raw_query};
 use planner::model::RANDOM;
 use prost::Message as _;
 use prost::bytes::{Buf, BufMut};

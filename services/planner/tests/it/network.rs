@@ -1,10 +1,6 @@
 //! Planner as a client of a router that starts late, stops, and restarts.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::soon;
+use crate::common::{self, soon};
 use planner::Config;
 use service_kit::SessionConfig;
 use service_kit::session::Mode;

@@ -1,11 +1,7 @@
 //! Transport of openpi's protocol: the answers of the core, and connections that outlive invalid requests.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{
-    Fixture, Gate, PATIENCE, checkpoint, image, method, plan_request, position_checkpoint, position_request, soon,
+use crate::common::{
+    self, Fixture, Gate, PATIENCE, checkpoint, image, method, plan_request, position_checkpoint, position_request, soon,
 };
 use cpn::{Method, MethodKind, Plan};
 use futures::{SinkExt, StreamExt};

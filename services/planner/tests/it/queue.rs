@@ -1,10 +1,6 @@
 //! Model thread under load and faults, with a method that waits for the test.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Client, Fixture, Gate, faulty, image, is, method, plan_request, random, soon};
+use crate::common::{self, Client, Fixture, Gate, faulty, image, is, method, plan_request, random, soon};
 use futures::future::join_all;
 use planner::core::PlannerCore;
 use planner::model::RANDOM;

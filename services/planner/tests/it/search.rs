@@ -1,10 +1,6 @@
 //! Searches chosen by requests, over every transport.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Client, Fixture, PATIENCE, checkpoint, from_bytes, is, plan_request, serve, soon, timeless};
+use crate::common::{self, Client, Fixture, PATIENCE, checkpoint, from_bytes, is, plan_request, serve, soon, timeless};
 use cpn::method::{Observed, Ongoing, Query};
 use cpn::{Input, Method, MethodKind, Plan};
 use planner::model::RANDOM;

@@ -1,11 +1,7 @@
 //! Listeners with TLS: clients are authorised by role; refusals are clear, logged and counted.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
+use crate::common::{self, Fixture, soon};
 use certs::Authority;
-use common::{Fixture, soon};
 use futures::StreamExt;
 use planner::{Config, Planner};
 use service_kit::SessionConfig;

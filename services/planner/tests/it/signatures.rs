@@ -1,22 +1,16 @@
 //! Unverified checkpoints are refused, or served with a warning, from every source.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-#[path = "common/signed.rs"]
-mod signed;
-
-use common::{Client, Fixture, checkpoint, from_bytes, from_file, soon};
+use crate::common::{Client, Fixture, checkpoint, from_bytes, from_file, soon};
 use cpn::MethodKind;
 use planner::Config;
 use service_kit::SessionConfig;
-use signed::{bundle, public_key};
 use signing::Trust;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 use tempfile::TempDir;
+use testing::signatures::{bundle, public_key};
 use wire::checkpoint::{CheckpointAnnouncement, CheckpointChunkRequest, CheckpointChunkResponse, CheckpointManifest};
 use wire::{Code, key, query};
 use zenoh::Session;

@@ -1,22 +1,16 @@
 //! Soak test: plans, goals, swaps, malformed requests and vanishing clients at once, against a planner in a process of its own.
 //! No valid request may fail, and memory may not grow.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Process, checkpoint, from_bytes, image, plan_request};
+use crate::common::{NAME, Program, checkpoint, connected, from_bytes, image, plan_request};
 use cpn::MethodKind;
 use prost::Message as _;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use service_kit::SessionConfig;
 use std::collections::BTreeMap;
-use std::net::TcpListener;
-use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
+use testing::process::Process;
 use tokio::task::JoinSet;
 use tonic::transport::Channel;
 use wire::planner::{PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
@@ -25,7 +19,6 @@ use wire::proto::planner_service_client::PlannerServiceClient;
 use wire::{Code, Error, decode, key, proto, query};
 use zenoh::Session;
 
-const NAME: &str = "soaked";
 const TIMEOUT: Duration = Duration::from_secs(30);
 /// Largest growth of memory between a tenth of the long run and its end.
 const MOST_GROWTH_BYTES: u64 = 20 << 20;
@@ -40,7 +33,7 @@ fn resident_bytes(process: &Process) -> u64 {
 /// Shared state of all clients.
 #[derive(Clone)]
 struct Load {
-    config: SessionConfig,
+    endpoint: String,
     grpc: String,
     end: Instant,
     /// Numbers of requests, by kind.
@@ -54,10 +47,7 @@ impl Load {
     }
 
     async fn session(&self) -> Session {
-        let session = service_kit::session::open(&self.config).await.unwrap();
-        let alive = session.liveliness().declare_subscriber(key::planner_alive(NAME).unwrap()).history(true);
-        common::soon(alive.await.unwrap().recv_async()).await.unwrap();
-        session
+        connected(&self.endpoint).await
     }
 
     async fn channel(&self) -> PlannerServiceClient<Channel> {
@@ -158,20 +148,16 @@ async fn vanishing(load: Load, mut rng: ChaCha8Rng) {
 
 /// Runs the load; returns the resident memory at a tenth of the time and at the end.
 async fn soak(duration: Duration) -> (u64, u64) {
-    let folder = tempfile::tempdir().unwrap();
-    for (name, method) in [("cpn", MethodKind::Cpn), ("te-bc", MethodKind::TeBc)] {
-        std::fs::write(folder.path().join(format!("{name}.safetensors")), checkpoint(method, 1)).unwrap();
-    }
-    let free = || TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let (zenoh, grpc) = (format!("tcp/{}", free()), free());
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-planner"));
-    command.args(["--name", NAME, "--listen", &zenoh, "--grpc-listen", &grpc.to_string(), "--models-dir"]);
-    let planner = Process(command.arg(folder.path()).env("RUST_LOG", "error").spawn().unwrap());
-    let config = SessionConfig { connect: vec![zenoh], ..SessionConfig::default() };
+    let checkpoints = [("cpn", MethodKind::Cpn), ("te-bc", MethodKind::TeBc)];
+    let checkpoints = checkpoints.map(|(name, method)| (name, checkpoint(method, 1)));
+    let program = Program::start(&checkpoints, |command| {
+        command.env("RUST_LOG", "error");
+    })
+    .await;
     let kinds = ["zenoh plans", "gRPC plans", "goals", "swaps", "malformed", "vanishing"];
     let done = Arc::new(kinds.map(|kind| (kind, AtomicU64::new(0))).into());
-    let load = Load { config, grpc: format!("http://{grpc}"), end: Instant::now() + duration, done };
-    load.session().await;
+    let (endpoint, grpc) = (program.endpoint.clone(), format!("http://{}", program.grpc));
+    let load = Load { endpoint, grpc, end: Instant::now() + duration, done };
 
     let mut clients = JoinSet::new();
     let rng = |seed| ChaCha8Rng::seed_from_u64(seed);
@@ -188,7 +174,7 @@ async fn soak(duration: Duration) -> (u64, u64) {
     while !clients.is_empty() {
         tokio::select! {
             _ = tick.tick() => {
-                let bytes = resident_bytes(&planner);
+                let bytes = resident_bytes(&program.process);
                 if begun.elapsed() * 10 > duration {
                     early.get_or_insert(bytes);
                 }
@@ -201,7 +187,7 @@ async fn soak(duration: Duration) -> (u64, u64) {
     for (kind, count) in &*load.done {
         assert!(count.load(Ordering::Relaxed) > 2, "{kind}: next to nothing was done");
     }
-    (early.unwrap(), resident_bytes(&planner))
+    (early.unwrap(), resident_bytes(&program.process))
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,10 +1,6 @@
 //! Swaps of models: between two plans, only for valid checkpoints, and invisible to requests except for the digest.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{Client, Fixture, checkpoint, from_bytes, from_file, is, plan_request, soon};
+use crate::common::{Client, Fixture, checkpoint, from_bytes, from_file, is, plan_request, soon};
 use cpn::MethodKind;
 use cpn::archive::{self, Tensor, Tensors};
 use std::collections::HashMap;

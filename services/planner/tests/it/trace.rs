@@ -1,18 +1,11 @@
 //! Spans of a request, as exported to a collector.
 
-#![expect(clippy::unwrap_used, reason = "tests")]
-
-mod common;
-
-use common::{PATIENCE, Process, plan_request};
+use crate::common::{NAME, PATIENCE, Program, plan_request};
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{TraceService, TraceServiceServer};
 use opentelemetry_proto::tonic::collector::trace::v1::{ExportTraceServiceRequest, ExportTraceServiceResponse};
 use opentelemetry_proto::tonic::trace::v1::Span;
 use planner::model::RANDOM;
 use prost::Message as _;
-use service_kit::SessionConfig;
-use std::net::TcpListener;
-use std::process::Command;
 use tokio::sync::mpsc;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
@@ -36,10 +29,6 @@ impl TraceService for Collector {
     }
 }
 
-fn free() -> String {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string()
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn spans_follow_a_request_from_its_client() {
     let (sender, mut spans) = mpsc::unbounded_channel();
@@ -48,32 +37,26 @@ async fn spans_follow_a_request_from_its_client() {
     let server = tonic::transport::Server::builder().add_service(TraceServiceServer::new(Collector(sender)));
     tokio::spawn(server.serve_with_incoming(incoming));
 
-    let (zenoh, grpc) = (format!("tcp/{}", free()), free());
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-planner"));
-    let models = tempfile::tempdir().unwrap();
-    command.arg("--models-dir").arg(models.path());
-    command.args(["--listen", &zenoh, "--grpc-listen", &grpc, "--name", "traced"]);
-    command.env("OTEL_EXPORTER_OTLP_ENDPOINT", collector).env("OTEL_BSP_SCHEDULE_DELAY", "100");
-    let _process = Process(command.spawn().unwrap());
-    let config = SessionConfig { connect: vec![zenoh], ..SessionConfig::default() };
-    let session = service_kit::session::open(&config).await.unwrap();
-    let alive = session.liveliness().declare_subscriber(key::planner_alive("traced").unwrap()).history(true);
-    common::soon(alive.await.unwrap().recv_async()).await.unwrap();
+    let program = Program::start(&[], |command| {
+        command.env("OTEL_EXPORTER_OTLP_ENDPOINT", collector).env("OTEL_BSP_SCHEDULE_DELAY", "100");
+    })
+    .await;
+    let session = &program.session;
 
     let traceparent = format!("00-{TRACE}-{PARENT}-01");
     let payload = plan_request(RANDOM, 1).encode_to_vec();
-    let asked = session.get(key::planner_plan("traced").unwrap()).payload(payload).attachment(&traceparent);
+    let asked = session.get(key::planner_plan(NAME).unwrap()).payload(payload).attachment(&traceparent);
     asked.await.unwrap().recv_async().await.unwrap().into_result().unwrap();
     assert_traced(&mut spans).await;
 
     let mut request = Request::new(plan_request(RANDOM, 1));
     request.metadata_mut().insert("traceparent", traceparent.parse().unwrap());
-    PlannerServiceClient::connect(format!("http://{grpc}")).await.unwrap().plan(request).await.unwrap();
+    PlannerServiceClient::new(program.channel.clone()).plan(request).await.unwrap();
     assert_traced(&mut spans).await;
 
     // A malformed traceparent is ignored.
     let payload = plan_request(RANDOM, 1).encode_to_vec();
-    let asked = session.get(key::planner_plan("traced").unwrap()).payload(payload).attachment("00-?");
+    let asked = session.get(key::planner_plan(NAME).unwrap()).payload(payload).attachment("00-?");
     asked.await.unwrap().recv_async().await.unwrap().into_result().unwrap();
 }
 

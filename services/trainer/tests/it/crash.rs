@@ -1,10 +1,6 @@
 //! A recorder that is killed repeatedly, at random moments, loses no acknowledged episode.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, files};
+use crate::common::{episode, files};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use recording::Episode;

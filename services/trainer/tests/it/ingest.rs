@@ -1,10 +1,6 @@
 //! Demonstration streams over real zenoh sessions: no episode is lost, stored twice, or stored invalid.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{commit, episode, files, info, record, sessions, steps};
+use crate::common::{self, commit, episode, files, info, record, sessions, steps};
 use recording::Episode;
 use std::time::Duration;
 use tokio::task::JoinSet;

@@ -1,10 +1,6 @@
 //! Commands whose standard output cannot be written.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, keep};
+use crate::common::{episode, keep};
 use std::fs::File;
 use std::process::{Command, ExitStatus, Stdio};
 use tempfile::TempDir;

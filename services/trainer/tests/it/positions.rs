@@ -1,10 +1,6 @@
 //! Training runs on positions.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, info, keep, steps};
+use crate::common::{episode, info, keep, steps};
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::recipe::GoalSampling;
 use cpn::{Frames, Input, Method, Model, ModelConfig, Planner, Precision, Preset, Recipe, Training, checkpoint};

@@ -1,18 +1,12 @@
 //! Published, promoted and rolled-back versions reach a running planner, and one that starts later.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-#[path = "../../planner/tests/common/signed.rs"]
-mod signed;
-
-use common::checkpoint;
+use crate::common::{self, checkpoint};
 use service_kit::{SessionConfig, files};
-use signed::{bundle, public_key};
 use signing::Trust;
 use std::path::Path;
 use std::process::Output;
 use std::time::Duration;
+use testing::signatures::{bundle, public_key};
 use tokio::process::Command;
 use trainer::service::{self, Service};
 use wire::planner::ModelInfo;

@@ -1,10 +1,6 @@
 //! Recordings: sending, mirroring, verification.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, files, info, keep, record, sessions, steps};
+use crate::common::{episode, files, info, keep, record, sessions, steps};
 use cpn::Input;
 use recording::Episode;
 use rustix::process::{Pid, Signal, kill_process};

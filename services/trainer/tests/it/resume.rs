@@ -1,10 +1,6 @@
 //! A real training run that is killed repeatedly has the result of an uninterrupted one.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, keep};
+use crate::common::{episode, keep};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::{Pid, Signal, kill_process};

@@ -1,10 +1,6 @@
 //! Contract of training runs of a real service, over each transport.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, keep};
+use crate::common::{NAME, episode, keep};
 use futures::{Stream, StreamExt};
 use prost::Message as _;
 use service_kit::SessionConfig;
@@ -28,7 +24,6 @@ use zenoh::key_expr::OwnedKeyExpr;
 
 /// Timeout that no passing test reaches.
 const PATIENCE: Duration = Duration::from_secs(120);
-const NAME: &str = "under-test";
 /// Settings of a short run.
 const SHORT: &str = "preset = \"paper-bc\"\nthreads = 1\ntraining.batch_size = 4\ntraining.epochs = 2\n";
 /// Settings of a run too long to finish before it is stopped.

@@ -1,10 +1,6 @@
 //! Samples, goals and batches of a training run.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{episode, keep, step};
+use crate::common::{episode, keep, step};
 use cpn::method::Observed;
 use cpn::recipe::GoalSampling;
 use cpn::{Input, ModelConfig, Preset, Recipe, Training};
@@ -117,6 +113,35 @@ fn samples_drawn_together_share_frames() {
     };
     let (frames, episodes) = frames(8);
     assert_eq!((frames, episodes), (9, 1));
+}
+
+/// With a dynamics loss, samples drawn together are successive, and a batch has the frame after each of their actions.
+#[test]
+fn a_dynamics_loss_gets_the_frames_after_the_actions() {
+    let dataset = dataset();
+    for block in [1, 3] {
+        let recipe = recipe(|training| {
+            (training.losses.dynamics, training.samples_per_draw, training.action_block) = (1.0, 4, block);
+        });
+        let sampler = Sampler::new(&dataset, &recipe, 3);
+        let samples = sampler.epoch(0);
+        let moments: BTreeSet<_> = samples.iter().map(|s| (s.episode, s.step)).collect();
+        assert_eq!((moments.len(), samples.len()), (dataset.sample_count(), dataset.sample_count()));
+        let successive =
+            samples.windows(2).filter(|pair| (pair[0].episode, pair[0].step + 1) == (pair[1].episode, pair[1].step));
+        assert!(successive.count() > samples.len() / 2);
+
+        let batch = sampler.batch(0, &samples);
+        let (frames, horizon) = (batch.frames.observed(), recipe.model.horizon as usize);
+        assert_eq!(batch.next.len(), samples.len() * horizon);
+        for (at, (next, mask)) in batch.next.iter().zip(&batch.mask).enumerate().filter(|(_, (_, mask))| **mask > 0.0) {
+            let (s, t) = (&samples[at / horizon], at % horizon);
+            let after = s.goal.min(s.step + (t + 1) as u32 * block as u32);
+            let recorded = step("reach", s.episode.into(), STEPS[s.episode as usize], after);
+            let Observed::Image(pixels) = frames[*next] else { panic!("an image") };
+            assert_eq!((pixels, *mask), (recorded.frame.data(), 1.0));
+        }
+    }
 }
 
 /// A run resumed within an epoch gets the batches of an uninterrupted run.

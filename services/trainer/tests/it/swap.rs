@@ -1,11 +1,7 @@
 //! Versions are promoted, announced, fetched and swapped in one after the other while clients plan: no plan fails, and each is,
 //! to the bit, that of the checkpoint it names.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::checkpoint;
+use crate::common::checkpoint;
 use service_kit::SessionConfig;
 use std::collections::HashMap;
 use std::sync::Arc;

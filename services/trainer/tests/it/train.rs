@@ -1,13 +1,9 @@
 //! Training runs on a few small episodes.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-
-use common::{SPEC, episode, info, keep, steps};
+use crate::common::{SPEC, episode, info, keep, steps};
 use cpn::engine::OuterLoss;
 use cpn::recipe::GoalSampling;
-use cpn::{Input, MethodKind, ModelConfig, Precision, Preset, Training, checkpoint};
+use cpn::{Input, Losses, MethodKind, ModelConfig, Precision, Preset, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
 use trainer::training::config::Config;
@@ -173,7 +169,9 @@ fn training_lowers_the_loss() {
         let recipe = base.recipe();
         let sampler = Sampler::new(&dataset, &recipe, 0);
         let batch = sampler.batch(0, &sampler.epoch(0));
-        OuterLoss::new(&model.config, Precision::Float32, 1).differentiate(&model.weights, &batch).loss
+        OuterLoss::new(&model.config, Losses::default(), Precision::Float32, 1)
+            .differentiate(&model.weights, &batch)
+            .loss
     };
     finished(&quick(base.clone(), 1, 50));
     let before = loss_of(&base.out);

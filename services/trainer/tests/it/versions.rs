@@ -1,18 +1,12 @@
 //! Versions of a model, through restarts and damage.
 
-#![expect(clippy::unwrap_used, reason = "a test")]
-
-mod common;
-#[path = "../../planner/tests/common/signed.rs"]
-mod signed;
-
-use common::checkpoint;
+use crate::common::{self, checkpoint};
 use cpn::archive::{self, Tensor, Tensors};
-use signed::bundle;
 use std::collections::BTreeSet;
 use std::num::NonZeroU16;
 use std::path::Path;
 use tempfile::TempDir;
+use testing::signatures::bundle;
 use trainer::publish::versions::Versions;
 use wire::checkpoint::{
     CheckpointAnnouncement, CheckpointChunkRequest, CheckpointManifest, ListVersionsRequest, PromoteVersionRequest,

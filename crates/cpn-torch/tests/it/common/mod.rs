@@ -1,7 +1,5 @@
 //! Agents and batches for tests.
 
-#![allow(dead_code, reason = "each test file uses its part")]
-
 use cpn::{Model, ModelConfig};
 use cpn_torch::loss::TensorBatch;
 use cpn_torch::{Agent, tensors};
@@ -45,5 +43,7 @@ pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Te
         steps_left: steps_left(count),
         actions: actions.shallow_clone(),
         mask: mask.shallow_clone(),
+        next: Tensor::zeros([0, actions.size()[1]], (Kind::Int64, Device::Cpu)),
+        positions: Tensor::zeros([0, 3], (Kind::Float, Device::Cpu)),
     }
 }

@@ -1,7 +1,5 @@
 //! Test network with an authority and a router.
 
-#![allow(dead_code, reason = "each test uses a part")]
-
 use certs::Authority;
 use service_kit::SessionConfig;
 use service_kit::session::Mode;

@@ -1,8 +1,5 @@
 //! A planner on loopback, and `cpn-eval` as a process that joins it.
 
-#![allow(dead_code, reason = "each test file uses its part")]
-#![expect(clippy::unwrap_used, reason = "tests")]
-
 use cpn::checkpoint::{self, Provenance};
 use cpn::{EncoderConfig, MethodKind, Model, ModelConfig};
 use planner::Planner;

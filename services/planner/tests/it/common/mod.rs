@@ -1,10 +1,6 @@
 //! Fixtures: a planner on loopback, and a client of each of its transports.
 
-#![allow(dead_code, reason = "each test file uses its part")]
-#![expect(clippy::unwrap_used, reason = "tests")]
-
 use cpn::checkpoint::{self, Provenance};
-use cpn::config::{ConvConfig, ImageEncoderConfig};
 use cpn::method::{Iterations, Observed, Query, Search, Solver};
 use cpn::{EncoderConfig, Input, Method, MethodKind, ModelConfig, Plan, Random};
 use planner::core::PlannerCore;
@@ -13,11 +9,15 @@ use planner::{Config, Planner};
 use prost::Message as _;
 use service_kit::SessionConfig;
 use std::future::Future;
-use std::process::Child;
+use std::net::SocketAddr;
+use std::process::Command;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
 use tempfile::TempDir;
+pub use testing::process::PATIENCE;
+use testing::process::{Log, Process, free_address};
+use testing::{provenance, small_config};
 use tonic::transport::Channel;
 use wire::planner::{
     ListModelsResponse, LoadModelRequest, LoadModelResponse, ModelInfo, PlanRequest, PlanResponse, RegisterGoalRequest,
@@ -28,8 +28,6 @@ use wire::{Code, Error, Message, key, proto, query};
 use zenoh::Session;
 use zenoh::key_expr::OwnedKeyExpr;
 
-/// Timeout that no passing test reaches.
-pub const PATIENCE: Duration = Duration::from_secs(60);
 /// Name of every planner here; their namespaces differ.
 pub const NAME: &str = "under-test";
 
@@ -45,10 +43,7 @@ pub struct Fixture {
 impl Fixture {
     /// Starts a planner with `checkpoints`, by name, and `configure`'s changes to the settings.
     pub async fn start(checkpoints: &[(&str, Vec<u8>)], configure: impl FnOnce(&mut Config)) -> Self {
-        let models_dir = TempDir::new().unwrap();
-        for (name, bytes) in checkpoints {
-            std::fs::write(models_dir.path().join(format!("{name}.safetensors")), bytes).unwrap();
-        }
+        let models_dir = models(checkpoints);
         static NAMESPACES: AtomicU64 = AtomicU64::new(0);
         let number = NAMESPACES.fetch_add(1, Ordering::Relaxed);
         let namespace = Some(format!("test-{}-{number}", std::process::id()));
@@ -82,14 +77,56 @@ impl Fixture {
     }
 }
 
-/// Process of a planner, killed when dropped.
-pub struct Process(pub Child);
+/// Planner in a process of its own, with a session and a channel to it.
+pub struct Program {
+    pub process: Process,
+    pub log: Log,
+    pub session: Session,
+    pub channel: Channel,
+    pub models_dir: TempDir,
+    /// Endpoint of zenoh.
+    pub endpoint: String,
+    pub grpc: SocketAddr,
+    pub metrics: SocketAddr,
+}
 
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+impl Program {
+    /// Starts a planner with `checkpoints`, by name, and `configure`'s options.
+    pub async fn start(checkpoints: &[(&str, Vec<u8>)], configure: impl FnOnce(&mut Command)) -> Self {
+        let models_dir = models(checkpoints);
+        let (endpoint, grpc, metrics) = (format!("tcp/{}", free_address()), free_address(), free_address());
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-planner"));
+        command.args(["--name", NAME, "--listen", &endpoint, "--grpc-listen", &grpc.to_string()]);
+        command.args(["--metrics-listen", &metrics.to_string(), "--models-dir"]).arg(models_dir.path());
+        configure(command.env_remove("RUST_LOG"));
+        let (process, log) = Process::logged(&mut command);
+        let session = connected(&endpoint).await;
+        let channel = Channel::from_shared(format!("http://{grpc}")).unwrap().connect().await.unwrap();
+        Self { process, log, session, channel, models_dir, endpoint, grpc, metrics }
     }
+
+    /// One client of each transport.
+    pub fn clients(&self) -> [Client; 2] {
+        [Client::Grpc(PlannerServiceClient::new(self.channel.clone())), Client::Zenoh(self.session.clone())]
+    }
+}
+
+/// Session with the planner that listens on an endpoint.
+pub async fn connected(endpoint: &str) -> Session {
+    let config = SessionConfig { connect: vec![endpoint.into()], ..SessionConfig::default() };
+    let session = service_kit::session::open(&config).await.unwrap();
+    let alive = session.liveliness().declare_subscriber(key::planner_alive(NAME).unwrap()).history(true);
+    soon(alive.await.unwrap().recv_async()).await.unwrap();
+    session
+}
+
+/// Folder of checkpoints, by name.
+fn models(checkpoints: &[(&str, Vec<u8>)]) -> TempDir {
+    let folder = TempDir::new().unwrap();
+    for (name, bytes) in checkpoints {
+        std::fs::write(folder.path().join(format!("{name}.safetensors")), bytes).unwrap();
+    }
+    folder
 }
 
 /// Client of one transport. Requests are protobuf messages, so that invalid ones can be sent.
@@ -234,38 +271,15 @@ pub fn checkpoint(method: MethodKind, seed: u64) -> Vec<u8> {
 
 /// Checkpoint of a small, random model with a render spec.
 pub fn checkpoint_for(method: MethodKind, seed: u64, render_spec: &str) -> Vec<u8> {
-    let encoder = EncoderConfig::Image(ImageEncoderConfig {
-        convolutions: vec![
-            ConvConfig { channels: 3, kernel: 8, stride: 8 },
-            ConvConfig { channels: 4, kernel: 4, stride: 3 },
-        ],
-        latent: 6,
-        layer_norm: true,
-    });
-    let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(method) };
-    let training_tasks = vec!["door-lock".into(), "reach".into()];
-    let provenance = Provenance {
-        training_tasks,
-        data_digest: "d".repeat(64),
-        render_spec: render_spec.into(),
-        seed,
-        training: cpn::Training::paper(),
-    };
-    checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
+    let provenance = Provenance { render_spec: render_spec.into(), ..provenance(&["door-lock", "reach"], seed) };
+    checkpoint::to_bytes(&cpn::Model::new(small_config(method), seed), &provenance).unwrap()
 }
 
 /// Checkpoint of a small, random model of positions.
 pub fn position_checkpoint(seed: u64) -> Vec<u8> {
     let encoder = EncoderConfig::position([600, 0, 200], 100);
     let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, actions: 3, ..ModelConfig::paper(MethodKind::Cpn) };
-    let provenance = Provenance {
-        training_tasks: vec!["jenga-poke".into()],
-        data_digest: "d".repeat(64),
-        render_spec: String::new(),
-        seed,
-        training: cpn::Training::paper(),
-    };
-    checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance).unwrap()
+    checkpoint::to_bytes(&cpn::Model::new(config, seed), &provenance(&["jenga-poke"], seed)).unwrap()
 }
 
 /// Plan request from one position to another.

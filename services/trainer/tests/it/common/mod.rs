@@ -1,97 +1,66 @@
-//! Fixtures: demonstrations with random frames, checkpoints, sessions and recorders.
+//! Fixtures: demonstrations, checkpoints, sessions and recorders.
 
-#![allow(dead_code, reason = "each test file uses its part")]
+mod episodes;
 
-use cpn::checkpoint::{self, Provenance};
-use cpn::config::{ConvConfig, ImageEncoderConfig};
-use cpn::{EncoderConfig, MethodKind, Model, ModelConfig, images};
-use rand::{Rng, RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use cpn::{MethodKind, Model, checkpoint};
 use recording::Episode;
 use service_kit::SessionConfig;
+use std::net::SocketAddr;
 use std::path::Path;
+use std::process::Command;
 use std::sync::Arc;
+use testing::process::{Log, PATIENCE, Process, free_address};
+use testing::{provenance, small_config};
 use trainer::record::folder::Recordings;
-use wire::Image;
-use wire::demonstration::{CommitEpisodeRequest, DemonstrationStep, RecordedEpisode, digest};
-use wire::sim::Variation;
+use wire::demonstration::CommitEpisodeRequest;
+use wire::key;
 use zenoh::Session;
+
+pub use episodes::{SPEC, episode, info, keep, step, steps};
 
 /// Data digest in the provenance of every checkpoint.
 pub const DATA_DIGEST: &str = "dddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddddd";
-/// Render spec of every frame.
-pub const SPEC: &str = r#"{"camera":"corner2"}"#;
-
-/// Step `step` of an episode: a random frame, and an action except at the end.
-pub fn step(task: &str, seed: u64, steps: u32, step: u32) -> DemonstrationStep {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + u64::from(step));
-    let mut data = vec![0; images::BYTES];
-    rng.fill_bytes(&mut data);
-    let side = images::SIZE as u32;
-    DemonstrationStep {
-        episode_id: format!("{task}-{seed}"),
-        step,
-        frame: Image::new(side, side, data).unwrap().rendered_as(SPEC).unwrap(),
-        action: (step + 1 < steps).then(|| (0..4).map(|_| rng.random_range(-1.0..1.0)).collect()),
-        state: vec![step as f32 * 0.01, 0.5, 0.2],
-        reward: step as f32,
-        success: step + 1 == steps,
-    }
-}
-
-/// All steps of an episode.
-pub fn steps(task: &str, seed: u64, count: u32) -> Vec<DemonstrationStep> {
-    (0..count).map(|number| step(task, seed, count, number)).collect()
-}
-
-/// Metadata of an episode of these steps.
-pub fn info(task: &str, seed: u64, steps: &[DemonstrationStep]) -> RecordedEpisode {
-    RecordedEpisode {
-        episode_id: format!("{task}-{seed}"),
-        variation: Variation { task: task.to_owned(), seed },
-        steps: steps.len() as u32,
-        digest: digest(steps),
-        goal_position: Vec::new(),
-        control_hz: 80.0,
-        render_spec: steps[0].frame.render_spec().to_owned(),
-    }
-}
-
-/// Episode with `count` steps.
-pub fn episode(task: &str, seed: u64, count: u32) -> Episode {
-    let steps = steps(task, seed, count);
-    Episode::new(info(task, seed, &steps), steps).unwrap()
-}
 
 /// Commit of an episode.
 pub fn commit(episode: &Episode) -> CommitEpisodeRequest {
     CommitEpisodeRequest { episode: episode.info().clone() }
 }
 
-/// Stores an episode in `folder`.
-pub fn keep(folder: &Path, episode: &Episode) {
-    Recordings::open(folder.to_owned()).unwrap().keep(episode).unwrap();
-}
-
 /// Checkpoint of a small, random model.
 pub fn checkpoint(seed: u64) -> Vec<u8> {
-    let encoder = EncoderConfig::Image(ImageEncoderConfig {
-        convolutions: vec![
-            ConvConfig { channels: 3, kernel: 8, stride: 8 },
-            ConvConfig { channels: 4, kernel: 4, stride: 3 },
-        ],
-        latent: 6,
-        layer_norm: true,
-    });
-    let config = ModelConfig { encoder, hidden: 5, gate_hidden: 4, ..ModelConfig::paper(MethodKind::Cpn) };
-    let provenance = Provenance {
-        training_tasks: vec!["reach".into()],
-        data_digest: DATA_DIGEST.into(),
-        render_spec: String::new(),
-        seed,
-        training: cpn::Training::paper(),
-    };
-    checkpoint::to_bytes(&Model::new(config, seed), &provenance).unwrap()
+    checkpoint::to_bytes(&Model::new(small_config(MethodKind::Cpn), seed), &provenance(&["reach"], seed)).unwrap()
+}
+
+/// `cpn-trainer serve` in a process of its own, with a session to it.
+pub struct Program {
+    pub process: Process,
+    pub log: Log,
+    pub session: Session,
+    pub grpc: SocketAddr,
+    pub metrics: SocketAddr,
+}
+
+/// Name of every trainer's process.
+pub const NAME: &str = "under-test";
+
+impl Program {
+    /// Starts a trainer in a folder, with `data`, `checkpoints` and `runs`.
+    pub async fn start(folder: &Path) -> Self {
+        let (endpoint, grpc, metrics) = (format!("tcp/{}", free_address()), free_address(), free_address());
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cpn-trainer"));
+        command.args(["serve", "--name", NAME, "--listen", &endpoint, "--grpc-listen", &grpc.to_string()]);
+        command.args(["--metrics-listen", &metrics.to_string()]).env_remove("RUST_LOG");
+        for (option, name) in [("--dataset", "data"), ("--checkpoints", "checkpoints"), ("--runs", "runs")] {
+            command.arg(option).arg(folder.join(name));
+        }
+        let (process, log) = Process::logged(&mut command);
+
+        let config = SessionConfig { connect: vec![endpoint], ..SessionConfig::default() };
+        let session = service_kit::session::open(&config).await.unwrap();
+        let alive = session.liveliness().declare_subscriber(key::trainer_alive(NAME).unwrap()).history(true);
+        tokio::time::timeout(PATIENCE, alive.await.unwrap().recv_async()).await.unwrap().unwrap();
+        Self { process, log, session, grpc, metrics }
+    }
 }
 
 /// Two sessions: one listens, the other connects to it.
