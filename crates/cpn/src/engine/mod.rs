@@ -43,8 +43,9 @@ pub use simd::element::Element;
 pub use training::adam::Adam;
 pub use training::encoder_pass::EncoderPass;
 pub use training::learner::NativeLearner;
-pub use training::outer_loop::{OuterLoop, Samples};
+pub use training::outer_loop::OuterLoop;
 pub use training::outer_loss::{Gradient, OuterLoss};
+pub use training::samples::Samples;
 
 /// An engine: computation of a model's plans and training steps on a device.
 pub trait Engine: Debug + Send + Sync {

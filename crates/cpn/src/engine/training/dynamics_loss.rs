@@ -1,7 +1,7 @@
 //! Dynamics loss of a block of samples: g_θ's predicted states under the demonstrated actions against the embeddings of the frames
 //! that followed.
 
-use super::outer_loop::Samples;
+use super::samples::Samples;
 use crate::engine::layers::passes::Order;
 use crate::engine::networks::policy_dynamics::{
     Branches, Buffers, Context, Cotangents, PolicyDynamics, PolicyDynamicsGradient, StepTape,
@@ -47,7 +47,7 @@ impl<T: Element> DynamicsLoss<T> {
         gradient: &mut PolicyDynamicsGradient<T>,
     ) -> T {
         let (horizon, latent) = (self.steps.len(), network.sizes.latent);
-        let rows = samples.x.len() / latent;
+        let rows = samples.rows(latent);
         let Self { steps, buffers, action, state_hat, x } = self;
         let (x, action) = (&mut x[..rows * latent], &mut action[..rows * network.sizes.actions]);
         let context = Context { x_g: samples.x_g, steps_left: samples.steps_left };

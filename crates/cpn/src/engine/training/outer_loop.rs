@@ -2,6 +2,7 @@
 //! several threads.
 
 use super::dynamics_loss::DynamicsLoss;
+use super::samples::Samples;
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
 use crate::engine::layers::passes::Order;
@@ -45,23 +46,6 @@ pub struct OuterGradient<T> {
     pub x_g: Vec<T>,
     /// The gradient by the weights' names in a checkpoint, for weights that affect the loss.
     pub weights: Vec<(String, Vec<T>)>,
-}
-
-/// Samples of a batch: embeddings and demonstrations.
-#[derive(Debug, Clone, Copy)]
-pub struct Samples<'a, T> {
-    /// x, `[R, Z]`.
-    pub x: &'a [T],
-    /// x_g, `[R, Z]`.
-    pub x_g: &'a [T],
-    /// k, the scaled number of steps left, `[R]`.
-    pub steps_left: &'a [T],
-    /// Demonstrated actions, `[R, H, A]`.
-    pub actions: &'a [T],
-    /// Mask, `[R, H]`: 1 for an action within the demonstration, else 0.
-    pub mask: &'a [T],
-    /// Embeddings of the frames after the demonstrated actions, `[R, H, Z]`; empty without a dynamics loss.
-    pub next: &'a [T],
 }
 
 /// Settings of the inner loop and the loss.
@@ -110,30 +94,6 @@ struct BlockTapes<T> {
     /// x along the rollout, then x̄, ẋ or x̂, `[R, Z]`.
     x: Vec<T>,
     x_hat: Vec<T>,
-}
-
-impl<'a, T: Element> Samples<'a, T> {
-    /// Number of samples; `latent` is Z.
-    fn rows(&self, latent: usize) -> usize {
-        self.x.len() / latent
-    }
-
-    /// The `count` samples from `first` on; `latent` is Z.
-    fn part(&self, latent: usize, first: usize, count: usize) -> Self {
-        let rows = self.rows(latent);
-        let cut = |values: &'a [T]| {
-            let columns = values.len() / rows;
-            &values[first * columns..(first + count) * columns]
-        };
-        Self {
-            x: cut(self.x),
-            x_g: cut(self.x_g),
-            steps_left: cut(self.steps_left),
-            actions: cut(self.actions),
-            mask: cut(self.mask),
-            next: cut(self.next),
-        }
-    }
 }
 
 impl<T: Element> OuterLoop<T> {

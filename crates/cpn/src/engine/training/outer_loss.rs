@@ -1,7 +1,8 @@
 //! Outer loss of a batch of frames, with its gradient in all weights: encoder and outer loop combined.
 
 use super::encoder_pass::EncoderPass;
-use super::outer_loop::{OuterLoop, Samples};
+use super::outer_loop::OuterLoop;
+use super::samples::Samples;
 use crate::batch::Batch;
 use crate::config::ModelConfig;
 use crate::engine::layers::linear::Weights;
