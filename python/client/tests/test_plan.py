@@ -78,18 +78,21 @@ def test_models_are_those_of_the_folder(planner: Planner) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "code", "field"),
+    ("model", "wrong", "code", "field"),
     [
-        ({"model": "nobody"}, "NOT_FOUND", "model"),
-        ({"model": "cpn", "search": Search(samples=8)}, "INVALID_ARGUMENT", "search.samples"),
-        ({"model": "cpn", "observation": (0.1, 0.2, 0.3)}, "INVALID_ARGUMENT", "position"),
-        ({"model": "cpn", "model_digest": "0" * 64}, "FAILED_PRECONDITION", "model_digest"),
-        ({"model": "cpn", "warm_start": [(2000.0, 0.0, 0.0, 0.0)] * 5}, "INVALID_ARGUMENT", "warm_start"),
+        ("nobody", {}, "NOT_FOUND", "model"),
+        ("cpn", {"search": Search(samples=8)}, "INVALID_ARGUMENT", "search.samples"),
+        ("cpn", {"observation": (0.1, 0.2, 0.3)}, "INVALID_ARGUMENT", "position"),
+        ("cpn", {"model_digest": "0" * 64}, "FAILED_PRECONDITION", "model_digest"),
+        ("cpn", {"warm_start": [(2000.0, 0.0, 0.0, 0.0)] * 5}, "INVALID_ARGUMENT", "warm_start"),
     ],
 )
-def test_refusals_name_code_and_field(planner: Planner, wrong: dict[str, Any], code: str, field: str) -> None:
+def test_refusals_name_code_and_field(
+    planner: Planner, model: str, wrong: dict[str, Any], code: str, field: str
+) -> None:
+    request: dict[str, Any] = {"goal": GOAL, "observation": FRAME} | wrong
     with pytest.raises(RefusedError) as refused:
-        planner.plan(goal=GOAL, **({"observation": FRAME} | wrong))
+        planner.plan(model=model, **request)
     assert (refused.value.code, refused.value.field) == (code, field)
     assert refused.value.expected
     assert str(refused.value).startswith(f"{code} {field}: expected ")

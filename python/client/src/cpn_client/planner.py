@@ -108,7 +108,7 @@ class Planner:
         *,
         model: str,
         seed: int = 0,
-        warm_start: bool = True,
+        warm_start: bool = False,
         deadline_ms: int | None = None,
         search: Search | None = None,
         with_fallback: Sequence[float] | None = None,
@@ -119,7 +119,8 @@ class Planner:
             goal: Registered goal, image of the finished task, or target position, x, y, z in metres.
             model: Name of the model.
             seed: Seed of the first plan; each step adds one.
-            warm_start: Whether each search starts from the plan before, moved on by one step.
+            warm_start: Whether each search starts from the plan before, moved on by one step, in place of the policy's
+                plan: for searches of many iterations.
             deadline_ms: Longest wait for an action, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             with_fallback: Action, [A], in place of one that is late or whose planner is away or too busy; None for the
@@ -203,7 +204,7 @@ class AsyncPlanner:
         *,
         model: str,
         seed: int = 0,
-        warm_start: bool = True,
+        warm_start: bool = False,
         deadline_ms: int | None = None,
         search: Search | None = None,
         with_fallback: Sequence[float] | None = None,

@@ -28,7 +28,7 @@ def open_session(address: Address) -> zenoh.Session:
     try:
         return zenoh.open(_config(address))
     except zenoh.ZError as error:
-        reason = re.sub(r" at /\S+:\d+\.?", "", str(error))
+        reason = re.sub(r"\s+at /\S+:\d+\.?", "", str(error))
         raise UnreachableError(f"{address.endpoint}: expected a zenoh router or planner, got {reason}") from None
 
 
