@@ -3,6 +3,7 @@ import inspect
 import os
 import random
 import re
+import signal
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
@@ -54,6 +55,9 @@ class PlannerProcess:
             if re.search("planner is ready", line):
                 return
         pytest.fail(log)
+
+    def send(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
 
     def kill(self) -> None:
         self._process.kill()

@@ -9,9 +9,9 @@ import grpc
 import zenoh
 from conftest import free_port
 
-from cpn.v1 import planner_pb2, planner_pb2_grpc
+from cpn.v1 import planner_pb2, planner_pb2_grpc, types_pb2
 
-Answer = Callable[[planner_pb2.PlanRequest], planner_pb2.PlanResponse]
+Answer = Callable[[planner_pb2.PlanRequest], planner_pb2.PlanResponse | types_pb2.Error]
 
 
 @contextmanager
@@ -26,7 +26,10 @@ def zenoh_planner(answer: Answer) -> Iterator[str]:
         def reply() -> None:
             assert query.payload
             response = answer(planner_pb2.PlanRequest.FromString(query.payload.to_bytes()))
-            query.reply(query.key_expr, response.SerializeToString())
+            if isinstance(response, types_pb2.Error):
+                query.reply_err(response.SerializeToString(), encoding="application/protobuf;cpn.v1.Error")
+            else:
+                query.reply(query.key_expr, response.SerializeToString())
             query.drop()
 
         threading.Thread(target=reply).start()
@@ -46,8 +49,14 @@ def grpc_planner(answer: Answer) -> Iterator[str]:
     """Planner at the yielded address."""
 
     class Servicer(planner_pb2_grpc.PlannerServiceServicer):
-        def Plan(self, request: planner_pb2.PlanRequest, context: object) -> planner_pb2.PlanResponse:  # noqa: N802
-            return answer(request)
+        def Plan(  # noqa: N802
+            self, request: planner_pb2.PlanRequest, context: grpc.ServicerContext
+        ) -> planner_pb2.PlanResponse:
+            response = answer(request)
+            if isinstance(response, types_pb2.Error):
+                context.set_trailing_metadata((("grpc-status-details-bin", response.SerializeToString()),))
+                context.abort(grpc.StatusCode.UNKNOWN, "")
+            return response
 
         def ListModels(self, request: object, context: object) -> planner_pb2.ListModelsResponse:  # noqa: N802
             return planner_pb2.ListModelsResponse()

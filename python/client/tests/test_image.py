@@ -10,8 +10,9 @@ import pytest
 from conftest import FRAME
 from numpy.typing import NDArray
 
+from cpn.v1 import types_pb2
 from cpn_client import Image
-from cpn_client.image import position
+from cpn_client.image import image_or_position
 
 
 class Tensor:
@@ -94,10 +95,12 @@ def test_missing_file_is_pillows_error(tmp_path: Path) -> None:
         Image.of(tmp_path / "none.png")
 
 
-def test_positions_are_three_numbers() -> None:
+def test_positions_are_three_numbers(pixels: NDArray[np.uint8]) -> None:
     for value in ((0.5, 1, -2), [0.5, 1.0, -2.0], np.array([0.5, 1, -2], np.float32)):
-        point = position(value)
-        assert point
-        assert (point.x, point.y, point.z) == (0.5, 1, -2)
-    for value in ((1, 2), "123", bytes(3), np.zeros((3, 84, 84), np.uint8), ("a", "b", "c"), 3.0, Tensor(np.zeros(3))):
-        assert position(value) is None
+        assert image_or_position(value, "goal") == types_pb2.Position(x=0.5, y=1, z=-2)
+    for value in (pixels, memoryview(pixels.data), pixels.tobytes(), FRAME, Image(pixels.tobytes())):
+        assert image_or_position(value, "goal") == Image(pixels.tobytes())
+    wrong: Any
+    for wrong in ((1, 2), ("a", "b", "c")):
+        with pytest.raises(ValueError, match=r"^goal: expected an image or three numbers, got "):
+            image_or_position(wrong, "goal")

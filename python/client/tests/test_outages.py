@@ -1,5 +1,6 @@
 """Late answers, and planners that are away."""
 
+import signal
 import threading
 
 import pytest
@@ -8,7 +9,7 @@ from conftest import FRAME, GOAL, Connect, PlannerProcess, Way, free_port, runni
 from fake import FAKES
 
 import cpn_client
-from cpn.v1 import planner_pb2
+from cpn.v1 import planner_pb2, types_pb2
 from cpn_client import LateError, NoPlannerError, Planner, RefusedError, Search, UnreachableError
 
 HOLD = (0.0, 0.0, 0.0, -1.0)
@@ -35,6 +36,71 @@ def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> Non
             planner.plan(model="m", goal=GOAL, observation=FRAME, seed=1, deadline_ms=500)
         assert first.wait(PATIENCE_SECONDS)
         assert planner.plan(model="m", goal=GOAL, observation=FRAME, seed=2).goal_id == "2"
+
+
+def test_frozen_planner_is_late(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
+    planner = connect(way.address(mortal))
+    asked = {"model": "random", "goal": GOAL, "observation": FRAME}
+    expected = planner.plan(seed=2, **asked).actions
+    mortal.send(signal.SIGSTOP)
+    with pytest.raises(LateError):
+        planner.plan(seed=1, deadline_ms=300, **asked)
+    mortal.send(signal.SIGCONT)
+    assert planner.plan(seed=2, **asked).actions == expected
+
+
+@pytest.mark.parametrize(
+    ("code", "field", "attempts"),
+    [
+        (types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, "queue", 3),
+        (types_pb2.ERROR_CODE_UNAVAILABLE, "", 3),
+        (types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, "search", 1),
+        (types_pb2.ERROR_CODE_INVALID_ARGUMENT, "model", 1),
+        (types_pb2.ERROR_CODE_INTERNAL, "", 1),
+    ],
+)
+def test_only_outages_are_retried(
+    connect: Connect, way: Way, code: types_pb2.ErrorCode, field: str, attempts: int
+) -> None:
+    requests = []
+
+    def answer(request: planner_pb2.PlanRequest) -> planner_pb2.PlanResponse | types_pb2.Error:
+        requests.append(request)
+        if len(requests) == 3:
+            return planner_pb2.PlanResponse(goal_id="g")
+        return types_pb2.Error(code=code, field=field, expected="other", got="this")
+
+    with FAKES[way.transport](answer) as address:
+        planner = connect(address)
+        if attempts == 3:
+            assert planner.plan(model="m", goal=GOAL, observation=FRAME).goal_id == "g"
+        else:
+            with pytest.raises(RefusedError, match=f"{field}: expected other, got this"):
+                planner.plan(model="m", goal=GOAL, observation=FRAME)
+    assert len(requests) == attempts
+
+
+def test_retries_end_with_the_deadline_and_the_last_error(connect: Connect, way: Way) -> None:
+    deadlines = []
+
+    def answer(request: planner_pb2.PlanRequest) -> types_pb2.Error:
+        deadlines.append(request.deadline_ms)
+        return types_pb2.Error(code=types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, field="queue")
+
+    with FAKES[way.transport](answer) as address:
+        planner = connect(address)
+        with pytest.raises(RefusedError, match="RESOURCE_EXHAUSTED queue"):
+            planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=500)
+    assert len(deadlines) > 1
+    assert 500 >= deadlines[0] > deadlines[-1]
+
+
+def test_planners_deadline_is_late(connect: Connect, way: Way) -> None:
+    error = types_pb2.Error(code=types_pb2.ERROR_CODE_DEADLINE_EXCEEDED, field="deadline_ms")
+    with FAKES[way.transport](lambda _: error) as address:
+        planner = connect(address)
+        with pytest.raises(LateError):
+            planner.plan(model="m", goal=GOAL, observation=FRAME)
 
 
 def test_deadline_is_sent_along(connect: Connect, way: Way) -> None:

@@ -1,5 +1,6 @@
 """Plans of a real planner with the shipped checkpoints."""
 
+import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -106,3 +107,33 @@ def test_threads_get_their_own_plans(process: PlannerProcess) -> None:
                 return planner.plan(model="random", goal=GOAL, observation=FRAME, seed=seed).actions
 
             assert list(threads.map(actions, range(64))) == [actions(seed) for seed in range(64)]
+
+
+def test_tasks_get_their_own_plans(process: PlannerProcess) -> None:
+    async def plans(address: str) -> list[Plan]:
+        async with cpn_client.connect_async(address) as planner:
+            requests = (
+                planner.plan(model="random", goal=GOAL, observation=FRAME, seed=seed) for seed in [*range(32)] * 2
+            )
+            return await asyncio.gather(*requests)
+
+    for address in (process.zenoh, process.grpc):
+        actions = [plan.actions for plan in asyncio.run(plans(address))]
+        assert actions[:32] == actions[32:]
+        assert len(set(actions)) == 32
+
+
+def test_cancelled_plan_leaves_the_connection_usable(process: PlannerProcess) -> None:
+    long = Search("cem", iterations=1000, samples=4096)
+
+    async def plan(address: str) -> Plan:
+        async with cpn_client.connect_async(address) as planner:
+            task = asyncio.create_task(planner.plan(model="cpn", goal=GOAL, observation=FRAME, search=long))
+            await asyncio.sleep(0.05)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            return await planner.plan(model="cpn", goal=GOAL, observation=FRAME)
+
+    for address in (process.zenoh, process.grpc):
+        assert asyncio.run(plan(address)).iterations_run == 1

@@ -1,7 +1,6 @@
 """Connections to planners."""
 
-import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 
 from tenacity import AsyncRetrying, Retrying
@@ -61,7 +60,7 @@ async def connect_async(
     tls: Tls | None = None,
     token: str = "",
     timeout_seconds: float = TIMEOUT_SECONDS,
-) -> AsyncIterator[AsyncPlanner]:
+) -> AsyncGenerator[AsyncPlanner, None]:
     """Context manager of a connection to a planner for asyncio; see `connect`."""
     where = Address(address, name, namespace, tls, token)
     where.check()
@@ -92,7 +91,6 @@ async def _open_async(address: Address, deadline: Deadline) -> AsyncTransport:
         from cpn_client.grpc import AsyncGrpcTransport
 
         return AsyncGrpcTransport(address)
-    from cpn_client.zenoh import AsyncZenohTransport, open_session
+    from cpn_client.zenoh import AsyncZenohTransport, open_session_async
 
-    session = await AsyncRetrying(**retries(deadline))(asyncio.to_thread, open_session, address)
-    return AsyncZenohTransport(session, address)
+    return AsyncZenohTransport(await AsyncRetrying(**retries(deadline))(open_session_async, address), address)

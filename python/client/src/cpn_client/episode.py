@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from cpn_client.errors import PlannerError, is_outage
-from cpn_client.image import Image, ImageLike, Position, position
+from cpn_client.image import Image, ImageLike, Position, image_or_position
 from cpn_client.plan import Action, Goal, Plan, Search
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ class _Steps:
         """Number of these that were the fallback."""
         self.plan: Plan | None = None
         """Last plan."""
-        is_image = not isinstance(goal, Goal) and position(goal) is None
-        self._goal = Image.of(goal, field="goal") if is_image else goal  # pyright: ignore[reportArgumentType]
+        self._goal = goal if isinstance(goal, Goal) else image_or_position(goal, "goal")
         self._settings = {"model": model, "deadline_ms": deadline_ms, "search": search}
         self._seed = seed
         self._warm_start = warm_start

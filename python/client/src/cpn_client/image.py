@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
 
 from cpn.v1 import types_pb2
 from cpn_client.errors import invalid
@@ -29,7 +29,7 @@ class SupportsArray(Protocol):
 ImageLike: TypeAlias = (
     "Image | bytes | bytearray | memoryview | str | os.PathLike[str] | SupportsArray | PIL.Image.Image"
 )
-Position: TypeAlias = "Sequence[float] | SupportsArray"
+Position: TypeAlias = "Sequence[float] | SupportsArray | types_pb2.Position"
 
 
 @dataclass(frozen=True, repr=False)
@@ -88,14 +88,22 @@ class Image:
         )
 
 
-def position(value: object) -> types_pb2.Position | None:
-    """Position, x, y, z in metres, from a sequence or array of three numbers; None for anything else."""
-    if isinstance(value, (str, bytes, bytearray, os.PathLike)) or not hasattr(value, "__len__"):
-        return None
+def image_or_position(value: ImageLike | Position, field: str) -> Image | types_pb2.Position:
+    """Image, or position, x, y, z in metres, from a sequence or array of three numbers.
+
+    Raises:
+        ValueError: If it is neither, named by `field`.
+    """
+    if isinstance(value, types_pb2.Position):
+        return value
+    if isinstance(value, (str, bytes, bytearray, memoryview, Image)) or not hasattr(value, "__len__"):
+        return Image.of(value, field=field)  # pyright: ignore[reportArgumentType]
     try:
-        x, y, z = (float(number) for number in value)  # pyright: ignore[reportGeneralTypeIssues]
+        x, y, z = (float(number) for number in cast("Sequence[float]", value))
     except (TypeError, ValueError):
-        return None
+        if isinstance(value, Sequence):
+            raise invalid(field, "an image or three numbers", value) from None
+        return Image.of(value, field=field)
     return types_pb2.Position(x=x, y=y, z=z)
 
 

@@ -230,7 +230,7 @@ class AsyncPlanner:
             except StopIteration as end:
                 return end.value
             try:
-                reply = await AsyncRetrying(**retries(deadline))(self._transport.call, request, deadline)
+                reply: bytes = await AsyncRetrying(**retries(deadline))(self._transport.call, request, deadline)
             except PlannerError as error:
                 step = partial(exchange.throw, error)
             else:

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError, Message
 from cpn.v1 import planner_pb2, types_pb2
 from cpn_client.deadline import Deadline
 from cpn_client.errors import PlannerError, RefusedError
-from cpn_client.image import Image, ImageLike, Position, position
+from cpn_client.image import Image, ImageLike, Position, image_or_position
 from cpn_client.plan import Action, Goal, Model, Plan, Search, StageTimes
 
 T = TypeVar("T")
@@ -75,19 +75,18 @@ def plan_request(
     )
     if isinstance(goal, Goal):
         request.goal_id = goal.id
-    elif target := position(goal):
-        request.goal_position.CopyFrom(target)
     else:
-        request.goal_image.CopyFrom(_image(goal, "goal"))
-    if hand := position(observation):
-        request.position.CopyFrom(hand)
+        target = image_or_position(goal, "goal")
+        if isinstance(target, Image):
+            request.goal_image.CopyFrom(target.to_proto())
+        else:
+            request.goal_position.CopyFrom(target)
+    observed = image_or_position(observation, "observation")
+    if isinstance(observed, Image):
+        request.observation.CopyFrom(observed.to_proto())
     else:
-        request.observation.CopyFrom(_image(observation, "observation"))
+        request.position.CopyFrom(observed)
     return request
-
-
-def _image(source: ImageLike | Position, field: str) -> types_pb2.Image:
-    return Image.of(source, field=field).to_proto()  # pyright: ignore[reportArgumentType]
 
 
 def plan(request: planner_pb2.PlanRequest, goal: object) -> Exchange[Plan]:

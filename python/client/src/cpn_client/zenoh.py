@@ -1,5 +1,8 @@
 """Transport over zenoh: each request is a query of its own."""
 
+# Zenoh's stubs leave return types out.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+
 import asyncio
 import json
 import os
@@ -30,6 +33,11 @@ def open_session(address: Address) -> zenoh.Session:
     except zenoh.ZError as error:
         reason = re.sub(r"\s+at /\S+:\d+\.?", "", str(error))
         raise UnreachableError(f"{address.endpoint}: expected a zenoh router or planner, got {reason}") from None
+
+
+async def open_session_async(address: Address) -> zenoh.Session:
+    """Form of `open_session` that leaves the loop free."""
+    return await asyncio.to_thread(open_session, address)
 
 
 def _config(address: Address) -> zenoh.Config:
