@@ -92,6 +92,6 @@ def test_other_authority_is_unreachable(secure: Secure, tmp_path: Path) -> None:
     trustme.CA().cert_pem.write_to_path(str(tmp_path / "ca.pem"))
     for address in (secure.process.zenoh, secure.process.grpc):
         with pytest.raises(UnreachableError):
-            cpn_client.connect(address, tls=Tls(tmp_path / "ca.pem"), timeout_seconds=0.3)
+            cpn_client.connect(address, tls=Tls(tmp_path / "ca.pem"), timeout_seconds=1.0)
     with pytest.raises(UnreachableError):
-        cpn_client.connect(secure.process.zenoh, tls=Tls(secure.tls.ca), timeout_seconds=0.3)
+        cpn_client.connect(secure.process.zenoh, tls=Tls(secure.tls.ca), timeout_seconds=1.0)

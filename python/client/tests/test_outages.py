@@ -1,6 +1,5 @@
 """Late answers, and planners that are away."""
 
-import signal
 import threading
 
 import pytest
@@ -14,6 +13,8 @@ from cpn_client import LateError, NoPlannerError, Planner, RefusedError, Search,
 
 HOLD = (0.0, 0.0, 0.0, -1.0)
 PATIENCE_SECONDS = 60.0
+SHORT_SECONDS = 1.0
+"""Time for attempts that all fail."""
 
 
 def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> None:
@@ -32,8 +33,8 @@ def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> Non
 
     with FAKES[way.transport](answer) as address:
         planner = connect(address)
-        with pytest.raises(LateError, match="no answer within 500 ms"):
-            planner.plan(model="m", goal=GOAL, observation=FRAME, seed=1, deadline_ms=500)
+        with pytest.raises(LateError, match="no answer within 1000 ms"):
+            planner.plan(model="m", goal=GOAL, observation=FRAME, seed=1, deadline_ms=1000)
         assert first.wait(PATIENCE_SECONDS)
         assert planner.plan(model="m", goal=GOAL, observation=FRAME, seed=2).goal_id == "2"
 
@@ -42,10 +43,10 @@ def test_frozen_planner_is_late(connect: Connect, way: Way, mortal: PlannerProce
     planner = connect(way.address(mortal))
     asked = {"model": "random", "goal": GOAL, "observation": FRAME}
     expected = planner.plan(seed=2, **asked).actions
-    mortal.send(signal.SIGSTOP)
+    mortal.freeze()
     with pytest.raises(LateError):
         planner.plan(seed=1, deadline_ms=300, **asked)
-    mortal.send(signal.SIGCONT)
+    mortal.thaw()
     assert planner.plan(seed=2, **asked).actions == expected
 
 
@@ -93,6 +94,22 @@ def test_retries_end_with_the_deadline_and_the_last_error(connect: Connect, way:
             planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=500)
     assert len(deadlines) > 1
     assert 500 >= deadlines[0] > deadlines[-1]
+
+
+def test_outage_before_a_late_attempt_is_the_error(connect: Connect, way: Way) -> None:
+    over, requests = threading.Event(), []
+
+    def answer(request: planner_pb2.PlanRequest) -> types_pb2.Error:
+        requests.append(request)
+        if len(requests) > 1:
+            assert over.wait(PATIENCE_SECONDS)
+        return types_pb2.Error(code=types_pb2.ERROR_CODE_UNAVAILABLE, expected="an answer", got="none")
+
+    with FAKES[way.transport](answer) as address:
+        planner = connect(address)
+        with pytest.raises(RefusedError, match="expected an answer, got none"):
+            planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=1000)
+        over.set()
 
 
 def test_planners_deadline_is_late(connect: Connect, way: Way) -> None:
@@ -149,18 +166,18 @@ def test_request_waits_for_a_restart(connect: Connect, way: Way, mortal: Planner
 def test_address_without_a_listener_is_unreachable(connect: Connect, way: Way) -> None:
     address = {"zenoh": "tcp/127.0.0.1:{}", "grpc": "grpc://127.0.0.1:{}"}[way.transport].format(free_port())
     with pytest.raises(UnreachableError, match=address):
-        connect(address, timeout_seconds=0.3)
+        connect(address, timeout_seconds=SHORT_SECONDS)
 
 
 @pytest.mark.parametrize("way", ["zenoh-sync", "zenoh-async"], indirect=True)
 def test_router_without_the_planner_has_no_planner(connect: Connect, process: PlannerProcess) -> None:
     with pytest.raises(NoPlannerError, match="planner named 'other'"):
-        connect(process.zenoh, name="other", timeout_seconds=0.3)
+        connect(process.zenoh, name="other", timeout_seconds=SHORT_SECONDS)
     config, endpoint = zenoh.Config(), f"tcp/127.0.0.1:{free_port()}"
     for key, value in (("mode", '"router"'), ("listen/endpoints", f'["{endpoint}"]')):
         config.insert_json5(key, value)
     with zenoh.open(config), pytest.raises(NoPlannerError, match="planner named 'planner'"):
-        connect(endpoint, timeout_seconds=0.3)
+        connect(endpoint, timeout_seconds=SHORT_SECONDS)
 
 
 @pytest.mark.parametrize("way", ["zenoh-sync", "zenoh-async"], indirect=True)
@@ -168,7 +185,7 @@ def test_planner_is_found_by_name_and_namespace(connect: Connect) -> None:
     with running("--name", "p7", "--namespace", "lab") as process:
         assert connect(process.zenoh, name="p7", namespace="lab").models()
         with pytest.raises(NoPlannerError):
-            connect(process.zenoh, name="p7", timeout_seconds=0.3)
+            connect(process.zenoh, name="p7", timeout_seconds=SHORT_SECONDS)
 
 
 @pytest.mark.parametrize("way", ["grpc-sync", "grpc-async"], indirect=True)
@@ -182,7 +199,7 @@ def test_other_server_of_grpc_has_no_planner(connect: Connect) -> None:
         port = server.add_insecure_port("127.0.0.1:0")
         server.start()
         with pytest.raises(NoPlannerError):
-            connect(f"grpc://127.0.0.1:{port}", timeout_seconds=0.3)
+            connect(f"grpc://127.0.0.1:{port}", timeout_seconds=SHORT_SECONDS)
         server.stop(None).wait()
 
 

@@ -59,7 +59,7 @@ def test_search_and_warm_start_are_the_planners(planner: Planner) -> None:
     )
     assert warm.actions == plan.warm_start
     anytime = planner.plan(
-        model="cpn", goal=GOAL, observation=FRAME, deadline_ms=500, search=Search("mppi", anytime=True)
+        model="cpn", goal=GOAL, observation=FRAME, deadline_ms=1000, search=Search("mppi", anytime=True)
     )
     assert anytime.iterations_run > 4
 
@@ -124,16 +124,17 @@ def test_tasks_get_their_own_plans(process: PlannerProcess) -> None:
 
 
 def test_cancelled_plan_leaves_the_connection_usable(process: PlannerProcess) -> None:
-    long = Search("cem", iterations=1000, samples=4096)
+    asked = {"model": "cpn", "goal": GOAL, "observation": FRAME}
+    long = Search("cem", samples=4096, anytime=True)
 
     async def plan(address: str) -> Plan:
         async with cpn_client.connect_async(address) as planner:
-            task = asyncio.create_task(planner.plan(model="cpn", goal=GOAL, observation=FRAME, search=long))
+            task = asyncio.create_task(planner.plan(search=long, deadline_ms=2000, **asked))
             await asyncio.sleep(0.05)
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task
-            return await planner.plan(model="cpn", goal=GOAL, observation=FRAME)
+            return await planner.plan(**asked)
 
     for address in (process.zenoh, process.grpc):
         assert asyncio.run(plan(address)).iterations_run == 1

@@ -36,14 +36,14 @@ class RefusedError(PlannerError):
         self.got = got
 
 
-def is_outage(error: BaseException) -> bool:
+def is_outage(error: PlannerError) -> bool:
     """Whether the planner is away, late or too busy to keep the deadline."""
     return isinstance(error, UnavailableError) or (
         isinstance(error, RefusedError) and error.code in (EXHAUSTED, UNAVAILABLE)
     )
 
 
-def can_be_retried(error: BaseException) -> bool:
+def can_be_retried(error: PlannerError) -> bool:
     """Whether the same request may be answered within its deadline: not after that, nor if its search is too long."""
     return is_outage(error) and not isinstance(error, LateError) and getattr(error, "field", "") != "search"
 

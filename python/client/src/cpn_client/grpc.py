@@ -46,7 +46,7 @@ class _Calls:
         code, details = error.code(), error.details()
         for key, value in error.trailing_metadata() or ():
             if key == "grpc-status-details-bin":
-                return refusal(value, deadline)
+                return refusal(value)
         if code == grpc.StatusCode.DEADLINE_EXCEEDED:
             return deadline.late()
         if code == grpc.StatusCode.UNAVAILABLE:

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError, Message
 
 from cpn.v1 import planner_pb2, types_pb2
 from cpn_client.deadline import Deadline
-from cpn_client.errors import PlannerError, RefusedError
+from cpn_client.errors import LateError, PlannerError, RefusedError
 from cpn_client.image import Image, ImageLike, Position, image_or_position
 from cpn_client.plan import Action, Goal, Model, Plan, Search, StageTimes
 
@@ -36,7 +36,7 @@ class Request:
         """Encodes the request, with the time left for it as a plan's own deadline.
 
         Raises:
-            LateError: If the deadline has passed.
+            PlannerError: If the deadline has passed.
         """
         left = deadline.left()
         if isinstance(self.message, planner_pb2.PlanRequest) and self.message.deadline_ms:
@@ -117,11 +117,11 @@ def models() -> Exchange[tuple[Model, ...]]:
     )
 
 
-def refusal(payload: bytes, deadline: Deadline) -> PlannerError:
+def refusal(payload: bytes) -> PlannerError:
     """Error of a planner, from a `cpn.v1.Error`."""
     error = _decode(types_pb2.Error, payload)
     if error.code == types_pb2.ERROR_CODE_DEADLINE_EXCEEDED:
-        return deadline.late()
+        return LateError(f"{error.field}: expected {error.expected}, got {error.got}")
     code = types_pb2.ErrorCode.Name(error.code).removeprefix("ERROR_CODE_")
     return RefusedError(code, error.field, error.expected, error.got)
 

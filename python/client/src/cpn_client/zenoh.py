@@ -97,7 +97,7 @@ class _Queries:
             return reply.ok.payload.to_bytes()
         # Zenoh reports its own timeouts as error replies too, in another encoding.
         if reply.err is not None and str(reply.err.encoding) == _encoding(types_pb2.Error.DESCRIPTOR.full_name):
-            raise refusal(reply.err.payload.to_bytes(), deadline)
+            raise refusal(reply.err.payload.to_bytes())
         raise deadline.late()
 
     def _no_reply(self) -> PlannerError:
