@@ -84,7 +84,7 @@ def process() -> Iterator[PlannerProcess]:
 
 
 @pytest.fixture
-def mortal() -> Iterator[PlannerProcess]:
+def restartable() -> Iterator[PlannerProcess]:
     """Planner of one test, which may kill it."""
     with running() as process:
         yield process
@@ -118,7 +118,7 @@ Connect = Callable[..., Any]
 
 
 @dataclass
-class Way:
+class Variant:
     """Transport and kind of a client under test."""
 
     transport: str
@@ -129,12 +129,12 @@ class Way:
 
 
 @pytest.fixture(params=["zenoh-sync", "zenoh-async", "grpc-sync", "grpc-async"])
-def way(request: pytest.FixtureRequest) -> Way:
-    return Way(*request.param.split("-"))
+def variant(request: pytest.FixtureRequest) -> Variant:
+    return Variant(*request.param.split("-"))
 
 
 @pytest.fixture
-def connect(way: Way) -> Iterator[Connect]:
+def connect(variant: Variant) -> Iterator[Connect]:
     """Connects a planner, blocking or not, until the test's end."""
     with ExitStack() as stack:
         loop = asyncio.new_event_loop()
@@ -149,10 +149,10 @@ def connect(way: Way) -> Iterator[Connect]:
             stack.callback(lambda: loop.run_until_complete(context.__aexit__(None, None, None)))
             return Blocking(loop, planner)
 
-        yield connect_sync if way.kind == "sync" else connect_async
+        yield connect_sync if variant.kind == "sync" else connect_async
 
 
 @pytest.fixture
-def planner(connect: Connect, way: Way, process: PlannerProcess) -> cpn_client.Planner:
+def planner(connect: Connect, variant: Variant, process: PlannerProcess) -> cpn_client.Planner:
     """Planner of each transport; an asynchronous one is made blocking."""
-    return connect(way.address(process))
+    return connect(variant.address(process))

@@ -84,8 +84,22 @@ def test_token_lets_in(secure: Secure) -> None:
     with cpn_client.connect(secure.process.grpc, tls=Tls(secure.tls.ca), token=TOKEN) as planner:
         assert len(planner.plan(model="cpn", goal=GOAL, observation=FRAME).actions) == 5
     for token in ("", "guessed"):
-        with pytest.raises(RefusedError, match="UNAUTHENTICATED"):
+        with pytest.raises(RefusedError, match=r"^UNAUTHENTICATED: expected an answer, got authorization"):
             cpn_client.connect(secure.process.grpc, tls=Tls(secure.tls.ca), token=token)
+
+
+def test_faulty_files_are_named(secure: Secure, tmp_path: Path) -> None:
+    faulty = tmp_path / "faulty.pem"
+    faulty.write_text("no certificate")
+    for tls in (
+        Tls(tmp_path / "none.pem"),
+        Tls(faulty),
+        Tls(secure.tls.ca, certificate=faulty, private_key=secure.tls.private_key),
+        Tls(secure.tls.ca, certificate=secure.tls.ca, private_key=secure.tls.private_key),
+    ):
+        for address in (secure.process.zenoh, secure.process.grpc):
+            with pytest.raises(ValueError, match=f"^tls: expected an authority {tls.ca}, and a certificate "):
+                cpn_client.connect(address, tls=tls)
 
 
 def test_other_authority_is_unreachable(secure: Secure, tmp_path: Path) -> None:

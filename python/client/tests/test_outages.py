@@ -4,7 +4,7 @@ import threading
 
 import pytest
 import zenoh
-from conftest import FRAME, GOAL, Connect, PlannerProcess, Way, free_port, running
+from conftest import FRAME, GOAL, Connect, PlannerProcess, Variant, free_port, running
 from fake import FAKES
 
 import cpn_client
@@ -17,7 +17,7 @@ SHORT_SECONDS = 1.0
 """Time for attempts that all fail."""
 
 
-def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> None:
+def test_late_answer_is_not_the_next_requests(connect: Connect, variant: Variant) -> None:
     first, second, sent = threading.Event(), threading.Event(), threading.Event()
 
     def answer(request: planner_pb2.PlanRequest) -> planner_pb2.PlanResponse:
@@ -31,7 +31,7 @@ def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> Non
             assert sent.wait(PATIENCE_SECONDS)
         return planner_pb2.PlanResponse(goal_id=str(request.seed))
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         with pytest.raises(LateError, match="no answer within 1000 ms"):
             planner.plan(model="m", goal=GOAL, observation=FRAME, seed=1, deadline_ms=1000)
@@ -39,14 +39,14 @@ def test_late_answer_is_not_the_next_requests(connect: Connect, way: Way) -> Non
         assert planner.plan(model="m", goal=GOAL, observation=FRAME, seed=2).goal_id == "2"
 
 
-def test_frozen_planner_is_late(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
-    planner = connect(way.address(mortal))
+def test_frozen_planner_is_late(connect: Connect, variant: Variant, restartable: PlannerProcess) -> None:
+    planner = connect(variant.address(restartable))
     asked = {"model": "random", "goal": GOAL, "observation": FRAME}
     expected = planner.plan(seed=2, **asked).actions
-    mortal.freeze()
+    restartable.freeze()
     with pytest.raises(LateError):
         planner.plan(seed=1, deadline_ms=300, **asked)
-    mortal.thaw()
+    restartable.thaw()
     assert planner.plan(seed=2, **asked).actions == expected
 
 
@@ -61,7 +61,7 @@ def test_frozen_planner_is_late(connect: Connect, way: Way, mortal: PlannerProce
     ],
 )
 def test_only_outages_are_retried(
-    connect: Connect, way: Way, code: types_pb2.ErrorCode, field: str, attempts: int
+    connect: Connect, variant: Variant, code: types_pb2.ErrorCode, field: str, attempts: int
 ) -> None:
     requests = []
 
@@ -71,7 +71,7 @@ def test_only_outages_are_retried(
             return planner_pb2.PlanResponse(goal_id="g")
         return types_pb2.Error(code=code, field=field, expected="other", got="this")
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         if attempts == 3:
             assert planner.plan(model="m", goal=GOAL, observation=FRAME).goal_id == "g"
@@ -81,14 +81,14 @@ def test_only_outages_are_retried(
     assert len(requests) == attempts
 
 
-def test_retries_end_with_the_deadline_and_the_last_error(connect: Connect, way: Way) -> None:
+def test_retries_end_with_the_deadline_and_the_last_error(connect: Connect, variant: Variant) -> None:
     deadlines = []
 
     def answer(request: planner_pb2.PlanRequest) -> types_pb2.Error:
         deadlines.append(request.deadline_ms)
         return types_pb2.Error(code=types_pb2.ERROR_CODE_RESOURCE_EXHAUSTED, field="queue")
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         with pytest.raises(RefusedError, match="RESOURCE_EXHAUSTED queue"):
             planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=500)
@@ -96,7 +96,7 @@ def test_retries_end_with_the_deadline_and_the_last_error(connect: Connect, way:
     assert 500 >= deadlines[0] > deadlines[-1]
 
 
-def test_outage_before_a_late_attempt_is_the_error(connect: Connect, way: Way) -> None:
+def test_outage_before_a_late_attempt_is_the_error(connect: Connect, variant: Variant) -> None:
     over, requests = threading.Event(), []
 
     def answer(request: planner_pb2.PlanRequest) -> types_pb2.Error:
@@ -105,29 +105,29 @@ def test_outage_before_a_late_attempt_is_the_error(connect: Connect, way: Way) -
             assert over.wait(PATIENCE_SECONDS)
         return types_pb2.Error(code=types_pb2.ERROR_CODE_UNAVAILABLE, expected="an answer", got="none")
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         with pytest.raises(RefusedError, match="expected an answer, got none"):
             planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=1000)
         over.set()
 
 
-def test_planners_deadline_is_late(connect: Connect, way: Way) -> None:
+def test_planners_deadline_is_late(connect: Connect, variant: Variant) -> None:
     error = types_pb2.Error(code=types_pb2.ERROR_CODE_DEADLINE_EXCEEDED, field="deadline_ms")
-    with FAKES[way.transport](lambda _: error) as address:
+    with FAKES[variant.transport](lambda _: error) as address:
         planner = connect(address)
         with pytest.raises(LateError):
             planner.plan(model="m", goal=GOAL, observation=FRAME)
 
 
-def test_deadline_is_sent_along(connect: Connect, way: Way) -> None:
+def test_deadline_is_sent_along(connect: Connect, variant: Variant) -> None:
     deadlines = []
 
     def answer(request: planner_pb2.PlanRequest) -> planner_pb2.PlanResponse:
         deadlines.append(request.deadline_ms)
         return planner_pb2.PlanResponse()
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         planner.plan(model="m", goal=GOAL, observation=FRAME, deadline_ms=60_000)
         planner.plan(model="m", goal=GOAL, observation=FRAME)
@@ -135,41 +135,43 @@ def test_deadline_is_sent_along(connect: Connect, way: Way) -> None:
     assert deadlines[1] == 0
 
 
-def test_goal_is_registered_again_after_a_restart(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
-    planner = connect(way.address(mortal), timeout_seconds=PATIENCE_SECONDS)
+def test_goal_is_registered_again_after_a_restart(
+    connect: Connect, variant: Variant, restartable: PlannerProcess
+) -> None:
+    planner = connect(variant.address(restartable), timeout_seconds=PATIENCE_SECONDS)
     goal = planner.goal(GOAL)
     before = planner.plan(model="cpn", goal=goal, observation=FRAME)
-    mortal.kill()
-    mortal.start()
+    restartable.kill()
+    restartable.start()
     after = planner.plan(model="cpn", goal=goal, observation=FRAME)
     assert (after.actions, after.goal_id) == (before.actions, goal.id)
     with pytest.raises(RefusedError, match="NOT_FOUND model"):
         planner.plan(model="nobody", goal=goal, observation=FRAME)
 
 
-def test_planner_that_has_gone_is_unreachable(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
-    planner = connect(way.address(mortal))
-    mortal.kill()
+def test_planner_that_has_gone_is_unreachable(connect: Connect, variant: Variant, restartable: PlannerProcess) -> None:
+    planner = connect(variant.address(restartable))
+    restartable.kill()
     with pytest.raises(UnreachableError):
         planner.plan(model="cpn", goal=GOAL, observation=FRAME, deadline_ms=1000)
 
 
-def test_request_waits_for_a_restart(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
-    planner = connect(way.address(mortal), timeout_seconds=PATIENCE_SECONDS)
-    mortal.kill()
-    restart = threading.Timer(0.5, mortal.start)
+def test_request_waits_for_a_restart(connect: Connect, variant: Variant, restartable: PlannerProcess) -> None:
+    planner = connect(variant.address(restartable), timeout_seconds=PATIENCE_SECONDS)
+    restartable.kill()
+    restart = threading.Timer(0.5, restartable.start)
     restart.start()
     assert len(planner.plan(model="cpn", goal=GOAL, observation=FRAME).actions) == 5
     restart.join()
 
 
-def test_address_without_a_listener_is_unreachable(connect: Connect, way: Way) -> None:
-    address = {"zenoh": "tcp/127.0.0.1:{}", "grpc": "grpc://127.0.0.1:{}"}[way.transport].format(free_port())
+def test_address_without_a_listener_is_unreachable(connect: Connect, variant: Variant) -> None:
+    address = {"zenoh": "tcp/127.0.0.1:{}", "grpc": "grpc://127.0.0.1:{}"}[variant.transport].format(free_port())
     with pytest.raises(UnreachableError, match=address):
         connect(address, timeout_seconds=SHORT_SECONDS)
 
 
-@pytest.mark.parametrize("way", ["zenoh-sync", "zenoh-async"], indirect=True)
+@pytest.mark.parametrize("variant", ["zenoh-sync", "zenoh-async"], indirect=True)
 def test_router_without_the_planner_has_no_planner(connect: Connect, process: PlannerProcess) -> None:
     with pytest.raises(NoPlannerError, match="planner named 'other'"):
         connect(process.zenoh, name="other", timeout_seconds=SHORT_SECONDS)
@@ -180,7 +182,7 @@ def test_router_without_the_planner_has_no_planner(connect: Connect, process: Pl
         connect(endpoint, timeout_seconds=SHORT_SECONDS)
 
 
-@pytest.mark.parametrize("way", ["zenoh-sync", "zenoh-async"], indirect=True)
+@pytest.mark.parametrize("variant", ["zenoh-sync", "zenoh-async"], indirect=True)
 def test_planner_is_found_by_name_and_namespace(connect: Connect) -> None:
     with running("--name", "p7", "--namespace", "lab") as process:
         assert connect(process.zenoh, name="p7", namespace="lab").models()
@@ -188,7 +190,7 @@ def test_planner_is_found_by_name_and_namespace(connect: Connect) -> None:
             connect(process.zenoh, name="p7", timeout_seconds=SHORT_SECONDS)
 
 
-@pytest.mark.parametrize("way", ["grpc-sync", "grpc-async"], indirect=True)
+@pytest.mark.parametrize("variant", ["grpc-sync", "grpc-async"], indirect=True)
 def test_other_server_of_grpc_has_no_planner(connect: Connect) -> None:
     from concurrent.futures import ThreadPoolExecutor
 
@@ -203,17 +205,17 @@ def test_other_server_of_grpc_has_no_planner(connect: Connect) -> None:
         server.stop(None).wait()
 
 
-def test_episode_goes_on_with_its_fallback(connect: Connect, way: Way, mortal: PlannerProcess) -> None:
-    planner = connect(way.address(mortal))
+def test_episode_goes_on_with_its_fallback(connect: Connect, variant: Variant, restartable: PlannerProcess) -> None:
+    planner = connect(variant.address(restartable))
     with planner.episode(GOAL, model="cpn", deadline_ms=10_000, with_fallback=HOLD) as episode:
         first = episode.act(FRAME)
         assert (episode.steps, episode.late) == (1, 0)
         digest = episode.plan.model_digest
-        mortal.kill()
+        restartable.kill()
         with planner.episode(GOAL, model="cpn", deadline_ms=300, with_fallback=HOLD) as other:
             assert other.act(FRAME) == HOLD
             assert (other.steps, other.late, other.plan) == (1, 1, None)
-        mortal.start()
+        restartable.start()
         assert episode.act(FRAME) == first
         assert (episode.steps, episode.late, episode.plan.model_digest) == (2, 0, digest)
 
@@ -235,7 +237,7 @@ def test_refusal_is_no_outage(planner: Planner) -> None:
     assert episode.late == 0
 
 
-def test_episode_keeps_seed_warm_start_and_checkpoint(connect: Connect, way: Way) -> None:
+def test_episode_keeps_seed_warm_start_and_checkpoint(connect: Connect, variant: Variant) -> None:
     requests = []
 
     def answer(request: planner_pb2.PlanRequest) -> planner_pb2.PlanResponse:
@@ -245,7 +247,7 @@ def test_episode_keeps_seed_warm_start_and_checkpoint(connect: Connect, way: Way
         response.first_action.values.extend([0.25, request.seed])
         return response
 
-    with FAKES[way.transport](answer) as address:
+    with FAKES[variant.transport](answer) as address:
         planner = connect(address)
         with planner.episode(GOAL, model="m", seed=7, warm_start=True) as episode:
             actions = [episode.act(FRAME, steps_left=left) for left in (3, 2)]

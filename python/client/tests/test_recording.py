@@ -39,7 +39,7 @@ def test_goal_of_a_trial_is_its_own(tmp_path: Path) -> None:
     assert recorded_goal(record(tmp_path / "trial.mcap", ("/episode", trial), frame(Image.of(FRAME)))) == goal
 
 
-@pytest.mark.parametrize("way", ["zenoh-sync"], indirect=True)
+@pytest.mark.parametrize("variant", ["zenoh-sync"], indirect=True)
 def test_goal_of_another_rendering_is_refused_by_the_planner(planner: Planner, tmp_path: Path) -> None:
     goal = Image(Image.of(GOAL).data, SPEC)
     with pytest.raises(RefusedError, match="render_spec"):

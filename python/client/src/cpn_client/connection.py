@@ -6,7 +6,6 @@ from contextlib import asynccontextmanager
 from tenacity import AsyncRetrying, Retrying
 
 from cpn_client.deadline import Deadline, retries
-from cpn_client.errors import PlannerError
 from cpn_client.planner import AsyncPlanner, Planner
 from cpn_client.transport import Address, AsyncTransport, Tls, Transport
 
@@ -34,7 +33,7 @@ def connect(
         timeout_seconds: Longest wait for the connection, and for the answer to a request without a deadline.
 
     Raises:
-        ValueError: If the address is malformed, or a setting does not go with it.
+        ValueError: If the address is malformed, a setting does not go with it, or a file of TLS is faulty.
         ImportError: If the address is of gRPC, and the extra `grpc` is not installed.
         UnreachableError: If there is no connection in time.
         NoPlannerError: If the connection leads to no planner.
@@ -45,7 +44,7 @@ def connect(
     planner = Planner(_open(where, Deadline(timeout_seconds)), timeout_seconds)
     try:
         planner.models()
-    except PlannerError:
+    except BaseException:
         planner.close()
         raise
     return planner

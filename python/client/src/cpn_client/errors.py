@@ -27,7 +27,8 @@ class RefusedError(PlannerError):
     """Refusal by the planner, `cpn.v1.Error`."""
 
     def __init__(self, code: str, field: str, expected: str, got: str) -> None:
-        super().__init__(f"{code} {field}: expected {expected}, got {got}")
+        refused = f"{code} {field}" if field else code
+        super().__init__(f"{refused}: expected {expected}, got {got}")
         self.code = code
         """Name of the gRPC status, for example `INVALID_ARGUMENT`."""
         self.field = field

@@ -1,6 +1,7 @@
 """Interface of the transports, and their addresses."""
 
 import re
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -29,6 +30,21 @@ class Tls:
             missing, given = ("certificate", "private_key") if self.private_key else ("private_key", "certificate")
             raise invalid(missing, f"a file, as {given} is given", None)
 
+    def check(self) -> None:
+        """Reads the files, since zenoh would report a faulty one only as a router that does not answer.
+
+        Raises:
+            ValueError: If they are not an authority, a certificate and its key.
+        """
+        try:
+            context = ssl.create_default_context(cafile=self.ca)
+            if self.certificate:
+                # An empty password, since OpenSSL would prompt on the terminal.
+                context.load_cert_chain(self.certificate, self.private_key, password="")
+        except OSError as error:
+            expected = f"an authority {self.ca}, and a certificate {self.certificate} with its key {self.private_key}"
+            raise invalid("tls", expected, error) from None
+
 
 @dataclass(frozen=True)
 class Address:
@@ -49,7 +65,7 @@ class Address:
         """Checks the combination of settings.
 
         Raises:
-            ValueError: If the endpoint is malformed, or a setting does not go with it.
+            ValueError: If the endpoint is malformed, a setting does not go with it, or a file of TLS is faulty.
         """
         if not self.is_grpc and not re.fullmatch(r"[a-z_-]+/.+", self.endpoint):
             expected = "a zenoh endpoint, for example tcp/127.0.0.1:7447, or grpc://HOST:PORT or grpcs://HOST:PORT"
@@ -62,6 +78,8 @@ class Address:
             raise invalid("address", "grpcs://HOST:PORT, as a token is given", self.endpoint)
         if self.tls and self.endpoint.startswith("grpc://"):
             raise invalid("address", "grpcs://HOST:PORT, as TLS files are given", self.endpoint)
+        if self.tls:
+            self.tls.check()
 
 
 class Transport(Protocol):
