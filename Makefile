@@ -140,14 +140,14 @@ test-soak: setup ## Half an hour of everything at once against one planner: noth
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
 	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back
-	cargo build --workspace --locked --bin cpn-planner
-	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
-
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo test --workspace --locked --test openpi
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
+test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back
+	cargo build --workspace --locked --bin cpn-planner
+	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
 
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
