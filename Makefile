@@ -5,6 +5,7 @@ TOOLS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/cpn/tools
 UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXAMPLES := examples/.venv
+CLIENT := python/client/.venv
 EXPORT := export/.venv
 BENCH := benches/peers/.venv
 OPENPI := tests/openpi/.venv
@@ -17,11 +18,11 @@ MESSAGES := messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
 REPORTED := $(sort $(dir $(patsubst %/,%,$(dir $(wildcard docs/results/leave_one_out/*/*/*-*.json)))))
 COMPOSE ?= docker-compose
 # All code in Python, as seen from sim-worker, whose settings hold for it.
-PYTHON := . $(addprefix ../,examples benches experiments export tests/golden tests/kubernetes tests/openpi tests/stack)
+PYTHON := . $(addprefix ../,examples benches experiments export python/client tests/golden tests/kubernetes tests/openpi tests/stack)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -42,8 +43,12 @@ $(WORKER)/.ready: sim-worker/pyproject.toml sim-worker/uv.lock $(MESSAGES) | $(U
 	cd sim-worker && $(UV) sync --quiet --locked --all-extras
 	touch $@
 
-$(EXAMPLES)/.ready: examples/pyproject.toml examples/uv.lock $(MESSAGES) | $(UV)
+$(EXAMPLES)/.ready: examples/pyproject.toml examples/uv.lock python/client/pyproject.toml $(MESSAGES) | $(UV)
 	cd examples && $(UV) sync --quiet --locked
+	touch $@
+
+$(CLIENT)/.ready: python/client/pyproject.toml python/client/uv.lock $(MESSAGES) | $(UV)
+	cd python/client && $(UV) sync --quiet --locked --all-extras
 	touch $@
 
 $(EXPORT)/.ready: export/pyproject.toml export/uv.lock $(MESSAGES) | $(UV)
@@ -140,6 +145,10 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back
+	cargo build --workspace --locked --bin cpn-planner
+	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
+
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
 	cd tests/stack && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest $(if $(ONLY),-k "$(ONLY)")
@@ -179,6 +188,10 @@ bench-stack: $(STACK)/.ready ## Measure the containers: throughput, start-up, re
 $(TOOLS)/bin/cargo-deny:
 	cargo install --quiet --locked --root $(TOOLS) cargo-deny@0.20.2
 
+dist: | $(UV) ## Build the wheels of the Python client and its messages into dist
+	$(UV) build --quiet --wheel --out-dir dist messages
+	$(UV) build --quiet --wheel --out-dir dist python/client
+
 deny: $(TOOLS)/bin/cargo-deny ## Check licences and sources of dependencies (advisories need GitHub: cargo deny check)
 	$(TOOLS)/bin/cargo-deny --locked check licenses bans sources
 
@@ -196,4 +209,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target $(WORKER) $(EXAMPLES) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
+	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
