@@ -137,7 +137,8 @@ fn a_killed_run_has_the_result_of_an_uninterrupted_one() {
 fn a_terminated_run_saves_its_state() {
     let folder = tempfile::tempdir().unwrap();
     let run = Run::new(folder.path(), "run");
-    let mut child = run.start(1000);
+    // So few epochs that every step is noted.
+    let mut child = run.start(90);
     run.reach(3, &mut child);
     kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
     let output = child.wait_with_output().unwrap();
@@ -148,7 +149,7 @@ fn a_terminated_run_saves_its_state() {
     assert_eq!(last, serde_json::json!({"interrupted": {"step": step}}));
     assert!(!run.out.exists());
 
-    let mut child = run.start(1000);
+    let mut child = run.start(90);
     run.reach(step + 1, &mut child);
     child.kill().unwrap();
     child.wait().unwrap();
