@@ -22,7 +22,7 @@ PYTHON := . $(addprefix ../,examples benches experiments export python/client te
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -99,6 +99,9 @@ experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the exp
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/aggregate.py $$results && \
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
 	done
+
+ablations: build ## Train CPN with other losses, two seeds each, and evaluate on the development tasks; goes on where it was interrupted
+	$(WORKER)/bin/python experiments/ablations.py
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	$(WORKER)/bin/python experiments/models.py

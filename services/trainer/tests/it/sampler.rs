@@ -144,6 +144,28 @@ fn a_dynamics_loss_gets_the_frames_after_the_actions() {
     }
 }
 
+/// With a position loss, a batch has the position of the hand in each frame, with mean 0 and standard deviation 1 in the dataset.
+#[test]
+fn a_position_loss_gets_the_hands_standardised_positions() {
+    let dataset = dataset();
+    let all = dataset.hand_positions();
+    assert_eq!(all.len(), STEPS.iter().sum::<u32>() as usize);
+    let moment = |power| all.iter().map(|position| position[0].powi(power)).sum::<f32>() / all.len() as f32;
+    // The fixtures' hand moves along the first axis alone.
+    assert!(moment(1).abs() < 1e-5 && (moment(2) - 3.0).abs() < 1e-4, "{} {}", moment(1), moment(2));
+    assert!(all.iter().all(|position| position[1..].iter().all(|value| value.abs() < 1e-5)));
+
+    let recipe = recipe(|training| training.losses.position = 1.0);
+    let sampler = Sampler::new(&dataset, &recipe, 3);
+    let samples = sampler.epoch(0);
+    let batch = sampler.batch(0, &samples);
+    assert_eq!(batch.positions.len(), batch.frames.observed().len());
+    for (s, row) in samples.iter().zip(&batch.observations) {
+        let first = dataset.episodes()[s.episode as usize].first_frame;
+        assert_eq!(batch.positions[*row], all[first + s.step as usize]);
+    }
+}
+
 /// A run resumed within an epoch gets the batches of an uninterrupted run.
 #[test]
 fn batches_continue_from_any_step() {

@@ -1,0 +1,104 @@
+"""Ablations of CPN's losses on the development tasks, which are left out of training all at once.
+
+Interrupted, it goes on. Each run's outcomes are kept in docs/results/ablations, of which --table makes the table.
+"""
+
+import argparse
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from dataset import DATASET, record
+from lab import ROOT, Lab, main, on_every_core, train
+
+RESULTS = ROOT / "docs/results/ablations"
+DEVELOPMENT = ("coffee-button", "dial-turn", "door-lock", "drawer-close", "handle-press", "handle-pull")
+"""The four tasks that the paper names, and two that `random.Random(0)` drew of the 20 others, in the order of names."""
+TRAINED = ("plate-slide", "window-close")
+"""Tasks of the training demonstrations, on other variations."""
+
+SETTINGS = {"training.epochs": 3, "training.samples_per_draw": 8, "training.precision": "bfloat16"}
+EVERY_UPDATE = {"training.losses.every_update": "true"}
+DYNAMICS = {"training.losses.dynamics": 0.5}
+POSITION = {"training.losses.position": 0.3}
+ARMS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "every-update": EVERY_UPDATE,
+    "every-update-dynamics": EVERY_UPDATE | DYNAMICS,
+    "every-update-dynamics-position": EVERY_UPDATE | DYNAMICS | POSITION,
+}
+"""Settings of training beside `SETTINGS`, by arm."""
+SEEDS = (0, 1)
+UPDATES = (0, 1, 5)
+TRIALS = 20
+
+Outcomes = dict[str, dict[str, list[int]]]
+"""1 for a success, 0 for a failure, of each variation in the order of seeds, by number of updates and task."""
+
+
+def run(arm: str, seed: int) -> None:
+    """Trains and evaluates an arm on one core, and keeps the outcomes."""
+    out = ROOT / f"runs/ablations/{arm}-{seed}"
+    checkpoint = out / "models/cpn.safetensors"
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    settings = SETTINGS | ARMS[arm]
+    options = ["--preset", "paper-cpn", "--dataset", str(DATASET), "--seed", str(seed)]
+    options += ["--hold-out", ",".join(DEVELOPMENT), "--run-dir", str(out / "run")]
+    options += [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
+    with Lab(out) as lab:
+        if not checkpoint.exists():
+            train(lab, checkpoint, *options)
+        lab.planner(checkpoint.parent)
+        lab.worker("w0")
+        search = ["--models", "cpn", "--tasks", ",".join(DEVELOPMENT + TRAINED), "--trials", str(TRIALS)]
+        for updates in UPDATES:
+            lab.evaluate(*search, "--updates", str(updates), "--out", str(out / f"updates-{updates}"))
+    keep(arm, seed, out)
+
+
+def keep(arm: str, seed: int, out: Path) -> None:
+    """Keeps the outcomes of an arm's records."""
+    successes: Outcomes = {}
+    for folder in sorted(out.glob("updates-*")):
+        for path in sorted(folder.glob("trials/*/cpn/*.json")):
+            trial = json.loads(path.read_text())
+            by_task = successes.setdefault(folder.name.removeprefix("updates-"), {})
+            by_task.setdefault(trial["task"], []).append(int(trial["outcome"] == "success"))
+    result = {"arm": arm, "seed": seed, "settings": SETTINGS | ARMS[arm], "successes": successes}
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    (RESULTS / f"{arm}-{seed}.json").write_text(json.dumps(result) + "\n")
+
+
+def table() -> str:
+    """Successes by arm, training seed and number of updates, in Markdown."""
+    lines = ["| arm | seed | U | development | trained | " + " | ".join(DEVELOPMENT) + " |"]
+    lines.append("|---" * (5 + len(DEVELOPMENT)) + "|")
+    for arm, seed in product(ARMS, SEEDS):
+        path = RESULTS / f"{arm}-{seed}.json"
+        outcomes: Outcomes = json.loads(path.read_text())["successes"] if path.exists() else {}
+        for updates, by_task in outcomes.items():
+            total = ["/".join(map(str, _count(by_task, tasks))) for tasks in (DEVELOPMENT, TRAINED)]
+            each = [str(sum(by_task[task])) for task in DEVELOPMENT]
+            lines.append(f"| {arm} | {seed} | {updates} | " + " | ".join(total + each) + " |")
+    return "\n".join(lines)
+
+
+def _count(by_task: dict[str, list[int]], tasks: tuple[str, ...]) -> tuple[int, int]:
+    """Successes and trials."""
+    outcomes = [outcome for task in tasks for outcome in by_task[task]]
+    return sum(outcomes), len(outcomes)
+
+
+def ablations() -> None:
+    """Runs all arms and prints the table, or prints the table alone."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--table", action="store_true", help="print the table of the kept outcomes, and run nothing")
+    if not parser.parse_args().table:
+        record()
+        on_every_core(lambda cell: run(*cell), product(ARMS, SEEDS))
+    print(table())
+
+
+if __name__ == "__main__":
+    main(ablations)
