@@ -33,7 +33,7 @@ pub fn checkpoint(seed: u64) -> Vec<u8> {
 
 /// `cpn-trainer serve` in a process of its own, with a session to it.
 pub struct Program {
-    pub process: Process,
+    _process: Process,
     pub log: Log,
     pub session: Session,
     pub grpc: SocketAddr,
@@ -59,7 +59,7 @@ impl Program {
         let session = service_kit::session::open(&config).await.unwrap();
         let alive = session.liveliness().declare_subscriber(key::trainer_alive(NAME).unwrap()).history(true);
         tokio::time::timeout(PATIENCE, alive.await.unwrap().recv_async()).await.unwrap().unwrap();
-        Self { process, log, session, grpc, metrics }
+        Self { _process: process, log, session, grpc, metrics }
     }
 }
 
