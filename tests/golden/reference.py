@@ -1,4 +1,4 @@
-"""An independent PyTorch implementation of CPN, which writes the golden tensors of `crates/cpn-torch/tests/it/golden.rs`.
+"""Independent PyTorch implementation of CPN, which writes the golden tensors of `crates/cpn-torch/tests/it/golden.rs`.
 
 Written from the paper alone, with other building blocks than the Rust code (einsum, `torch.func`, explicit weights), so
 that a shared mistake is unlikely. Run it again only when the mathematics changes:
