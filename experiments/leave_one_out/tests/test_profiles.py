@@ -27,7 +27,7 @@ def counted(done: subprocess.CompletedProcess[str]) -> dict[str, int]:
 def test_a_profile_has_the_jobs_of_its_folds_methods_and_seeds(
     tmp_path: Path, profile: str, training: int, evaluation: int
 ) -> None:
-    """Results that are in the repository are not computed again, and a report of some folds does not end the experiment."""
+    """Results in the repository are not computed again, and a report of some folds does not end the experiment."""
     there = [path.stem for path in (ROOT / "docs/results/leave_one_out" / profile).glob("*/*-*.json")]
     trained = [stem for stem in there if stem.rpartition("-")[0] in TRAINED]
     jobs = counted(dry_run(tmp_path, profile))
