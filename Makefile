@@ -129,7 +129,7 @@ stack: ## Build the containers, evaluate in them, leave the report in runs/stack
 
 test: setup ## Everything that must pass
 	cargo test --workspace --locked
-	cd sim-worker && $(UV) run --quiet pytest
+	cd sim-worker && $(UV) run --quiet pytest --numprocesses auto --dist loadfile
 
 test-crash: setup ## Kill the recorder a hundred times
 	cargo test --workspace --locked --test it -- --ignored crash::

@@ -154,7 +154,7 @@ def test_what_is_finished_is_not_run_again(folder: Path, tmp_path: Path) -> None
         cell.touch()
     assert NOTHING in run(folder, "--dry-run")
 
-    # Nor do the rules, which provenance would watch: without our pinned triggers, the same change runs all cells again.
+    # Nor do the rules, which provenance would watch: without our pinned triggers, the same change runs cells again.
     here = tmp_path / "experiments/leave_one_out"
     shutil.copytree(HERE, here, ignore=shutil.ignore_patterns(".venv", "tests"))
     for part in ("sim-worker", "crates", "services", "Cargo.lock", "docs"):
@@ -162,8 +162,15 @@ def test_what_is_finished_is_not_run_again(folder: Path, tmp_path: Path) -> None
     snakefile = here / "Snakefile"
     snakefile.write_text(snakefile.read_text().replace('"{RUN} train', '"nice {RUN} train'))
     assert NOTHING in run(folder, "--dry-run", here=here)
+
+    # Of a cell without its result, too.
+    result = next(folder.glob("smoke/*/cpn-0.json"))
+    aside = result.rename(tmp_path / result.name)
+    pinned = run(folder, "--dry-run", here=here)
     again = run(folder, "--dry-run", "--rerun-triggers", "mtime", "code", "params", here=here)
-    assert NOTHING not in again
+    aside.rename(result)
+    assert "rule result" in pinned
+    assert "rule train" not in pinned
     assert "rule train" in again
 
 
