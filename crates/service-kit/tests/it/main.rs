@@ -4,4 +4,3 @@
 
 mod architecture;
 mod limits;
-mod listener;

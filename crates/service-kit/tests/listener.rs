@@ -1,4 +1,6 @@
-//! Listener against silent clients, too many clients, and a lack of file descriptors.
+//! Listener against silent clients, too many clients, and a lack of file descriptors: in a program of its own, whose limit it sets.
+
+#![expect(clippy::unwrap_used, reason = "a test")]
 
 use metrics_exporter_prometheus::PrometheusBuilder;
 use service_kit::listener::{ListenConfig, Listener};
