@@ -200,7 +200,7 @@ deny: $(TOOLS)/bin/cargo-deny ## Check licences and sources of dependencies (adv
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
-	cd fuzz && cargo fmt --check && cargo metadata --locked --format-version 1 >/dev/null
+	cd fuzz && cargo fmt --check && cargo metadata --locked --filter-platform x86_64-unknown-linux-gnu --format-version 1 >/dev/null
 	cargo clippy --workspace --all-targets --locked -- -D warnings
 	cargo clippy --package planner --package trainer --no-default-features --locked -- -D warnings
 	cd sim-worker && $(UV) run --quiet ruff check $(PYTHON) && $(UV) run --quiet ruff format --check $(PYTHON) && $(UV) run --quiet basedpyright
