@@ -90,7 +90,8 @@ struct BlockTapes<T> {
     actions_dot: Vec<T>,
     /// Gradients of the cloning losses of the plans before the updates, `[H, R, A]` each.
     cloning_hat: Vec<Vec<T>>,
-    dynamics: DynamicsLoss<T>,
+    /// Made for the first batch with a dynamics loss.
+    dynamics: Option<DynamicsLoss<T>>,
     /// x along the rollout, then x̄, ẋ or x̂, `[R, Z]`.
     x: Vec<T>,
     x_hat: Vec<T>,
@@ -178,7 +179,7 @@ impl<T: Element> BlockTapes<T> {
             actions_hat: zeros(horizon * actions),
             actions_dot: zeros(horizon * actions),
             cloning_hat: (0..updates).map(|_| zeros(horizon * actions)).collect(),
-            dynamics: DynamicsLoss::new(network, rows, horizon),
+            dynamics: None,
             x: zeros(latent),
             x_hat: zeros(latent),
         }
@@ -228,8 +229,9 @@ impl<T: Element> BlockTapes<T> {
         }
 
         if !samples.next.is_empty() {
+            let dynamics = self.dynamics.get_or_insert_with(|| DynamicsLoss::new(network, BLOCK, settings.horizon));
             accumulators.loss +=
-                self.dynamics.run(network, settings.dynamics, samples, (x_hat, x_g_hat), &mut accumulators.network);
+                dynamics.run(network, settings.dynamics, samples, (x_hat, x_g_hat), &mut accumulators.network);
         }
     }
 
