@@ -6,19 +6,19 @@ UV := $(TOOLS)/bin/uv
 WORKER := sim-worker/.venv
 EXAMPLES := examples/.venv
 CLIENT := python/client/.venv
-EXPORT := export/.venv
-BENCH := benches/peers/.venv
+EXPORT := python/export/.venv
+BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
 EXPERIMENT := experiments/leave_one_out/.venv
 # Sources of cpn-messages, a dependency of several environments.
-MESSAGES := messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
+MESSAGES := python/messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
 # Folders of the experiment's committed results, one a profile.
 REPORTED := $(sort $(dir $(patsubst %/,%,$(dir $(wildcard docs/results/leave_one_out/*/*/*-*.json)))))
 COMPOSE ?= docker-compose
 # All code in Python, as seen from sim-worker, whose settings hold for it.
-PYTHON := . $(addprefix ../,examples benches experiments export python/client tests/golden tests/kubernetes tests/openpi tests/stack)
+PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
@@ -51,12 +51,12 @@ $(CLIENT)/.ready: python/client/pyproject.toml python/client/uv.lock $(MESSAGES)
 	cd python/client && $(UV) sync --quiet --locked --all-extras
 	touch $@
 
-$(EXPORT)/.ready: export/pyproject.toml export/uv.lock $(MESSAGES) | $(UV)
-	cd export && $(UV) sync --quiet --locked
+$(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock $(MESSAGES) | $(UV)
+	cd python/export && $(UV) sync --quiet --locked
 	touch $@
 
-$(BENCH)/.ready: benches/peers/pyproject.toml benches/peers/uv.lock | $(UV)
-	cd benches/peers && $(UV) sync --quiet --locked
+$(BENCH)/.ready: python/bench-peers/pyproject.toml python/bench-peers/uv.lock | $(UV)
+	cd python/bench-peers && $(UV) sync --quiet --locked
 	touch $@
 
 $(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock $(MESSAGES) | $(UV)
@@ -141,7 +141,7 @@ test-soak: setup ## Half an hour of everything at once against one planner: noth
 	cargo test --workspace --locked --test it -- --ignored --nocapture soak::
 
 test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
-	cd export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+	cd python/export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo test --workspace --locked --test it -- openpi::
@@ -160,7 +160,7 @@ test-kubernetes: $(KUBERNETES)/.ready ## Check the manifests for a cluster, with
 	cd tests/kubernetes && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-bench: $(BENCH)/.ready ## Check the mathematics of the benches' peers, and their harness
-	cd benches/peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+	cd python/bench-peers && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-experiment: setup $(EXPERIMENT)/.ready ## Run the experiment's smoke profile, kill it on its way, and check what it leaves
 	cargo test --workspace --locked --no-run
@@ -173,7 +173,7 @@ fuzz: system ## Feed the decoders what a stranger may send, ten minutes each (FU
 	scripts/fuzz.sh
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
-	cd sim-worker && $(UV) run --quiet ../benches/sim.py
+	cd sim-worker && $(UV) run --quiet benches/sim.py
 
 bench-train: build $(BENCH)/.ready ## Compare training steps with PyTorch and JAX, in an environment of their own (QUICK=1 for a glance)
 	$(BENCH)/bin/python -m cpn_bench.train.bench --out runs/bench $(if $(QUICK),--quick) \
@@ -192,7 +192,7 @@ $(TOOLS)/bin/cargo-deny:
 	cargo install --quiet --locked --root $(TOOLS) cargo-deny@0.20.2
 
 dist: | $(UV) ## Build the wheels of the Python client and its messages into dist
-	$(UV) build --quiet --wheel --out-dir dist messages
+	$(UV) build --quiet --wheel --out-dir dist python/messages
 	$(UV) build --quiet --wheel --out-dir dist python/client
 
 deny: $(TOOLS)/bin/cargo-deny ## Check licences and sources of dependencies (advisories need GitHub: cargo deny check)

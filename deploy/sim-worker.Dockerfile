@@ -21,13 +21,13 @@ WORKDIR /src/sim-worker
 
 # Dependencies first; `--build-arg EXTRAS="--extra jenga"` adds the Jenga scene's arm.
 ARG EXTRAS=
-COPY messages/pyproject.toml /src/messages/
+COPY python/messages/pyproject.toml /src/python/messages/
 COPY sim-worker/pyproject.toml sim-worker/uv.lock sim-worker/README.md ./
 RUN /uv/bin/uv sync --quiet --locked --no-dev --no-install-local ${EXTRAS}
 
 # The messages, generated when their package is built, and the worker.
 COPY proto /src/proto
-COPY messages /src/messages
+COPY python/messages /src/python/messages
 COPY sim-worker/src src
 RUN /uv/bin/uv sync --quiet --locked --no-dev --no-editable ${EXTRAS}
 

@@ -5,9 +5,9 @@ uv run --project sim-worker --with-editable python/client examples/closed_loop.p
 
 import sys
 
-import cpn_client
 import numpy as np
 
+import cpn_client
 from cpn_sim_worker.expert import solve
 from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.simulator import Simulator

@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
-from scipy.stats import binomtest
-
 from cells import ROOT
+from numpy.typing import NDArray
 from results import HERE, Cell, Results
+from scipy.stats import binomtest
 
 sys.path.append(str(ROOT / "sim-worker/src"))
 from cpn_sim_worker.tasks import TASKS

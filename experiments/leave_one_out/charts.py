@@ -6,7 +6,6 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
 from results import Results
 
 mpl.use("Agg")

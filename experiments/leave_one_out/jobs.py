@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from lab import PROGRAMS, Lab, main, train
-
 import records
+from lab import PROGRAMS, Lab, main, train
 
 Cell = dict[str, Any]  # JSON; cells.py has the fields.
 

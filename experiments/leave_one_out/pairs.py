@@ -13,11 +13,10 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+from cells import digest
 from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
-
-from cells import digest
 from results import Cell, Results
 
 Pair = dict[str, Any]  # JSON, of pairs.json.

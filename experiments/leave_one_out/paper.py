@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import yaml
-
 from results import HERE, Results
 
 Measure = Callable[[Results, int, list[str]], list[str]]

@@ -6,9 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
-
 from charts import charts
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from paper import beside
 from results import HERE, Results
 

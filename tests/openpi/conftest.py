@@ -8,10 +8,11 @@ from pathlib import Path
 import grpc
 import numpy as np
 import pytest
-from cpn.v1 import planner_pb2_grpc, types_pb2
 from numpy.typing import NDArray
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from PIL import Image
+
+from cpn.v1 import planner_pb2_grpc, types_pb2
 
 ROOT = Path(__file__).resolve().parents[2]
 PLANNER = os.environ.get("CPN_PLANNER", str(ROOT / "target/debug/cpn-planner"))

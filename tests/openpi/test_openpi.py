@@ -7,12 +7,12 @@ import urllib.request
 
 import numpy as np
 import pytest
-from cpn.v1 import planner_pb2
+from conftest import ROOT, Planner, message
 from numpy.typing import NDArray
 from openpi_client.action_chunk_broker import ActionChunkBroker
 from openpi_client.image_tools import resize_with_pad
 
-from conftest import ROOT, Planner, message
+from cpn.v1 import planner_pb2
 
 Pictures = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 MODELS = ["bc", "cpn", "random", "te-bc", "upn"]

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import grpc
 import pytest
-from cpn.v1 import planner_pb2, planner_pb2_grpc
+from conftest import PLANNER, ROOT
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.exceptions import InvalidStatus
 
-from conftest import PLANNER, ROOT
+from cpn.v1 import planner_pb2, planner_pb2_grpc
 
 CERTS = os.environ.get("CPN_CERTS", str(ROOT / "target/debug/cpn-certs"))
 

@@ -2,10 +2,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from experiment_results import write
-
 from aggregate import compare, folds, latent_distance, main, mean, rate, summarise, updates
 from cells import ROOT
+from experiment_results import write
 from report import report
 from results import Results, ResultsError
 

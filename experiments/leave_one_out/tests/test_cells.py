@@ -3,7 +3,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from cells import ROOT, SOURCES, ProfileError, plan, source_digest
 
 TASKS = ("a", "b", "c")

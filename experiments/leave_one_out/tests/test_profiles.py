@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-
 from cells import ROOT
 
 HERE = ROOT / "experiments/leave_one_out"

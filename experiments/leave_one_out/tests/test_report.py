@@ -4,12 +4,11 @@ import json
 import re
 from pathlib import Path
 
+import aggregate
 import pytest
 from experiment_results import write
-from PIL import Image
-
-import aggregate
 from paper import beside
+from PIL import Image
 from report import report
 from results import Results
 

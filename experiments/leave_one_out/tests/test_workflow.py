@@ -12,13 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pairs
 import psutil
 import pytest
 import yaml
-from PIL import Image
-
-import pairs
 from cells import ROOT
+from PIL import Image
 from results import Results
 
 HERE = ROOT / "experiments/leave_one_out"

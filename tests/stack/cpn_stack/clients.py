@@ -7,6 +7,7 @@ from pathlib import Path
 
 import grpc
 import zenoh
+
 from cpn.v1 import planner_pb2_grpc
 
 

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import zenoh
+
 from cpn.v1 import planner_pb2
 from cpn_sim_worker import keys
 from cpn_sim_worker.session import ZenohConfig, ask, open_session

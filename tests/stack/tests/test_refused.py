@@ -6,8 +6,8 @@ from pathlib import Path
 import grpc
 import pytest
 import zenoh
-from cpn.v1 import planner_pb2
 
+from cpn.v1 import planner_pb2
 from cpn_stack import clients
 from cpn_stack.docker import docker, inspect, logs, read_folder, wait_until, write_file
 from cpn_stack.metrics import Metrics

@@ -8,7 +8,7 @@ from cpn_export.error import ExportError
 from cpn_export.recording import read_episode, read_header
 from tests.support import SIZE, Sample
 
-GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "episode_digest.json"
+GOLDEN = Path(__file__).resolve().parents[3] / "tests" / "golden" / "episode_digest.json"
 
 
 def read(path: Path) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap
 from skimage.metrics import structural_similarity
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "runs/bench/sim.json"
 COMMAND = "make bench-sim"
 

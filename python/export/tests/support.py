@@ -3,10 +3,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from cpn.v1 import demonstration_pb2
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
+
+from cpn.v1 import demonstration_pb2
 
 SIZE, STATE_SIZE, ACTION_SIZE = 84, 39, 4
 
