@@ -4,6 +4,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,25 @@ def test_lost_steps_are_sent_again_and_kept_episodes_are_not(
     assert trainer.received == []
 
 
+def test_demonstration_with_noise_keeps_the_experts_actions_and_the_applied_ones(
+    trainer: Trainer, endpoint: str, simulator: Simulator
+) -> None:
+    run = demonstrate(endpoint, "--tasks", "coffee-button", "--episodes", "1", "--noise", "0.5")
+    assert run.returncode == 0, run.stderr
+    (episode,) = trainer.kept.values()
+    assert episode.episode_id == "coffee-button-0-noise-0.5"
+    steps = [trainer.steps[episode.episode_id][number] for number in range(episode.steps)]
+    assert episode.digest == digest(steps)
+    disturbed = [step for step in steps if step.HasField("applied_action")]
+    assert disturbed
+    assert all(step.applied_action.values[:3] != step.action.values[:3] for step in disturbed)
+    simulator.reset("coffee-button", 0)
+    for before, after in pairwise(steps):
+        applied = before.applied_action if before.HasField("applied_action") else before.action
+        arrival = simulator.step(action_from_proto(applied, 4, "action"))
+        assert np.array_equal(after.state, arrival.state.astype(np.float32))
+
+
 def test_slow_trainer_gets_everything(trainer: Trainer, endpoint: str) -> None:
     """A trainer that answers commits long before it has processed the steps."""
     trainer.seconds_per_step = 0.05
@@ -157,6 +177,7 @@ def test_digest_is_the_same_in_every_language() -> None:
         Step(
             frame=types_pb2.Image(data=bytes((7 * i + 13 * n) % 256 for i in range(84 * 84 * 3))),
             action=types_pb2.Action(values=[0.5, -0.25, n, 1.0]) if n < 2 else None,
+            applied_action=types_pb2.Action(values=[-0.5, 0.25, -1.0, -1.0]) if n == 1 else None,
             state=[n + 0.5, -1.0],
             reward=n * 0.125,
             success=n == 2,

@@ -71,7 +71,7 @@ impl Agent {
         loss + first.mse_loss(&batch.positions.to_kind(first.kind()), Reduction::Mean) * losses.position
     }
 
-    /// The outer loss from x to x_g, both `[B, Z]`; `next`, `[B H, Z]`, are the embeddings after the demonstrated actions.
+    /// The outer loss from x to x_g, both `[B, Z]`; `next`, `[B H, Z]`, are the embeddings after the applied actions.
     pub fn loss_from(
         &self,
         x: &Tensor,
@@ -85,7 +85,7 @@ impl Agent {
         let cloning = cloned.iter().map(|plan| loss::mean_squared(plan, &batch.actions, &batch.mask));
         let cloning = cloning.sum::<Tensor>() / cloned.len() as f64;
         let Some(next) = next else { return cloning };
-        let states = Tensor::stack(&self.inner_loop().states(x, x_g, &batch.actions), 1);
+        let states = Tensor::stack(&self.inner_loop().states(x, x_g, &batch.applied_actions), 1);
         cloning + loss::mean_squared(&states, &next.view_as(&states), &batch.mask) * losses.dynamics
     }
 

@@ -17,6 +17,8 @@ pub struct TensorBatch {
     pub steps_left: Tensor,
     /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Tensor,
+    /// Actions that were applied, `[B, H, A]`; empty without a dynamics loss.
+    pub applied_actions: Tensor,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Tensor,
     /// Index among the frames of the frame after each action, `[B, H]` integers; empty without a dynamics loss.
@@ -29,6 +31,7 @@ impl TensorBatch {
     /// A batch for plans of H = `horizon` steps, on a device.
     pub fn new(batch: &Batch, horizon: i64, device: Device) -> Self {
         let samples = batch.observations.len() as i64;
+        let action_size = batch.actions.len() as i64 / (samples * horizon);
         let on_device = |tensor: Tensor| tensor.to_device(device);
         Self {
             frames: on_device(tensors::from_frames(&batch.frames)),
@@ -36,6 +39,7 @@ impl TensorBatch {
             goals: on_device(tensors::from_indices(&batch.goals)),
             steps_left: on_device(tensors::from_steps_left(batch.steps_left.iter().copied())),
             actions: on_device(Tensor::from_slice(&batch.actions).view([samples, horizon, -1])),
+            applied_actions: on_device(Tensor::from_slice(&batch.applied_actions).view([-1, horizon, action_size])),
             mask: on_device(Tensor::from_slice(&batch.mask).view([samples, horizon])),
             next: on_device(tensors::from_indices(&batch.next).view([-1, horizon])),
             positions: on_device(Tensor::from_slice(batch.positions.as_flattened()).view([-1, 3])),

@@ -15,6 +15,8 @@ pub struct Batch {
     pub steps_left: Vec<u32>,
     /// Demonstrated actions after the observation, `[B, H, A]`; 0 past the demonstration's end.
     pub actions: Vec<f32>,
+    /// Actions that were applied, `[B, H, A]`: the demonstrated ones, or with noise added; empty without a dynamics loss.
+    pub applied_actions: Vec<f32>,
     /// 1 for an action within the demonstration, else 0, `[B, H]`.
     pub mask: Vec<f32>,
     /// Index among the frames of the frame after each action within the demonstration, `[B, H]`, any past its end; empty without a

@@ -23,7 +23,7 @@ pub struct Losses {
     /// True if the plans before and after every update are cloned, all with the same weight, so that every number of updates up to
     /// the model's gives a policy.
     pub every_update: bool,
-    /// Weight of the dynamics loss: the mean squared error between the states predicted under the demonstrated actions, after one to
+    /// Weight of the dynamics loss: the mean squared error between the states predicted under the applied actions, after one to
     /// H steps, and the embeddings of the frames that followed, which get no gradient from it.
     pub dynamics: f64,
     /// Weight of the position loss: the mean squared error between the first three elements of each frame's embedding and the

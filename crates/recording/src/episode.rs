@@ -30,7 +30,7 @@ impl Episode {
                 check("frame", size(first), size(step))?;
                 check("frame.render_spec", &*info.render_spec, step.frame.render_spec())?;
                 check("state", values(&first.state), values(&step.state))?;
-                check_action(step, number == last.step, first.action.as_ref().map_or(0, Vec::len))
+                check_actions(step, number == last.step, first.action.as_ref().map_or(0, Vec::len))
             };
             fits().map_err(|e| e.within(&format!("steps[{number}]")))?;
         }
@@ -59,18 +59,21 @@ fn check<T: PartialEq + ToString>(field: &str, expected: T, got: T) -> Result<()
     if expected == got { Ok(()) } else { Err(Error::invalid(field, expected, got)) }
 }
 
-fn check_action(step: &DemonstrationStep, is_last: bool, width: usize) -> Result<(), Error> {
-    let Some(action) = &step.action else {
-        return if is_last { Ok(()) } else { Err(Error::invalid("action", "an action", "none")) };
-    };
-    if is_last {
-        return Err(Error::invalid("action", "none at the goal frame", "an action"));
+fn check_actions(step: &DemonstrationStep, is_last: bool, width: usize) -> Result<(), Error> {
+    if step.action.is_none() && !is_last {
+        return Err(Error::invalid("action", "an action", "none"));
     }
-    check("action", format!("{width} values"), values(action))?;
-    match action.iter().find(|value| value.abs() > 1.0) {
-        Some(value) => Err(Error::invalid("action", "values in [-1, 1]", value)),
-        None => Ok(()),
+    for (field, action) in [("action", &step.action), ("applied_action", &step.applied_action)] {
+        let Some(action) = action else { continue };
+        if is_last {
+            return Err(Error::invalid(field, "none at the goal frame", "an action"));
+        }
+        check(field, format!("{width} values"), values(action))?;
+        if let Some(value) = action.iter().find(|value| value.abs() > 1.0) {
+            return Err(Error::invalid(field, "values in [-1, 1]", value));
+        }
     }
+    Ok(())
 }
 
 fn size(step: &DemonstrationStep) -> String {

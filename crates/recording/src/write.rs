@@ -26,6 +26,6 @@ pub fn to_bytes(episode: &Episode) -> Result<Vec<u8>, McapError> {
 }
 
 fn recorded_step(step: &DemonstrationStep) -> proto::RecordedStep {
-    let DemonstrationStep { step, action, state, reward, success, .. } = step.clone();
-    RecordedStep { step, action, state, reward, success }.into()
+    let DemonstrationStep { step, action, applied_action, state, reward, success, .. } = step.clone();
+    RecordedStep { step, action, applied_action, state, reward, success }.into()
 }

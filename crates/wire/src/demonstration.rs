@@ -22,8 +22,10 @@ pub struct DemonstrationStep {
     pub step: u32,
     /// Camera image before the action.
     pub frame: Image,
-    /// Action of the expert; none at the last step, whose frame is the goal.
+    /// Action of the demonstrator; none at the last step, whose frame is the goal.
     pub action: Option<Vec<f32>>,
+    /// Action that was applied, if it is another: with noise added.
+    pub applied_action: Option<Vec<f32>>,
     /// Simulator state before the action, at most 1024 values; the hand's x, y, z in metres come first.
     pub state: Vec<f32>,
     /// Reward of the previous action; 0 at the first step.
@@ -57,6 +59,7 @@ pub struct RecordedEpisode {
 pub struct RecordedStep {
     pub step: u32,
     pub action: Option<Vec<f32>>,
+    pub applied_action: Option<Vec<f32>>,
     pub state: Vec<f32>,
     pub reward: f32,
     pub success: bool,
@@ -65,8 +68,8 @@ pub struct RecordedStep {
 impl RecordedStep {
     /// Full step, with the episode's identifier and the frame.
     pub fn with_frame(self, episode_id: String, frame: Image) -> DemonstrationStep {
-        let Self { step, action, state, reward, success } = self;
-        DemonstrationStep { episode_id, step, frame, action, state, reward, success }
+        let Self { step, action, applied_action, state, reward, success } = self;
+        DemonstrationStep { episode_id, step, frame, action, applied_action, state, reward, success }
     }
 }
 
@@ -84,14 +87,15 @@ pub struct CommitEpisodeResponse {
     pub missing_steps: Vec<u32>,
 }
 
-/// SHA-256, in hex, over the steps in order: each step's pixels, then action, state and reward as little-endian 32-bit
-/// floats, then one byte for success (1 or 0). A missing action adds no bytes. A reward of -0 counts as 0, since protobuf
-/// drops the sign of a zero.
+/// SHA-256, in hex, over the steps in order: each step's pixels, then action, applied action, state and reward as
+/// little-endian 32-bit floats, then one byte for success (1 or 0). A missing action adds no bytes. A reward of -0 counts as 0,
+/// since protobuf drops the sign of a zero.
 pub fn digest<'a>(steps: impl IntoIterator<Item = &'a DemonstrationStep>) -> String {
     let mut hasher = Sha256::new();
-    for DemonstrationStep { frame, action, state, reward, success, .. } in steps {
+    for DemonstrationStep { frame, action, applied_action, state, reward, success, .. } in steps {
         hasher.update(frame.data());
-        for value in action.iter().flatten().chain(state).chain([&(reward + 0.0)]) {
+        let actions = action.iter().chain(applied_action).flatten();
+        for value in actions.chain(state).chain([&(reward + 0.0)]) {
             hasher.update(value.to_le_bytes());
         }
         hasher.update([u8::from(*success)]);
@@ -103,6 +107,10 @@ fn step_count(field: &str, value: u32, min: u32, max: u32) -> Result<u32, Error>
     if (min..=max).contains(&value) { Ok(value) } else { Err(Error::invalid(field, format!("{min} to {max}"), value)) }
 }
 
+fn optional_action(field: &str, value: Option<proto::Action>) -> Result<Option<Vec<f32>>, Error> {
+    value.map(action).transpose().map_err(|e| e.within(field))
+}
+
 impl Message for DemonstrationStep {
     type Proto = proto::DemonstrationStep;
 }
@@ -111,18 +119,20 @@ impl TryFrom<proto::DemonstrationStep> for DemonstrationStep {
     type Error = Error;
 
     fn try_from(step: proto::DemonstrationStep) -> Result<Self, Error> {
-        let proto::DemonstrationStep { episode_id, step, frame, action, state, reward, success } = step;
+        let proto::DemonstrationStep { episode_id, step, frame, action, applied_action, state, reward, success } = step;
         let episode_id = name("episode_id", episode_id)?;
-        let recorded = RecordedStep::try_from(proto::RecordedStep { step, action, state, reward, success })?;
+        let recorded =
+            RecordedStep::try_from(proto::RecordedStep { step, action, applied_action, state, reward, success })?;
         Ok(recorded.with_frame(episode_id, required("frame", frame)?))
     }
 }
 
 impl From<DemonstrationStep> for proto::DemonstrationStep {
     fn from(step: DemonstrationStep) -> Self {
-        let DemonstrationStep { episode_id, step, frame, action, state, reward, success } = step;
-        let action = action.map(|values| proto::Action { values });
-        Self { episode_id, step, frame: Some(frame.into()), action, state, reward, success }
+        let DemonstrationStep { episode_id, step, frame, action, applied_action, state, reward, success } = step;
+        let [action, applied_action] =
+            [action, applied_action].map(|action| action.map(|values| proto::Action { values }));
+        Self { episode_id, step, frame: Some(frame.into()), action, applied_action, state, reward, success }
     }
 }
 
@@ -142,7 +152,8 @@ impl TryFrom<proto::RecordedStep> for RecordedStep {
         }
         Ok(Self {
             step: step_count("step", step.step, 0, MAX_STEPS - 1)?,
-            action: step.action.map(action).transpose().map_err(|e| e.within("action"))?,
+            action: optional_action("action", step.action)?,
+            applied_action: optional_action("applied_action", step.applied_action)?,
             state: finite("state", step.state)?,
             reward: step.reward,
             success: step.success,
@@ -152,8 +163,10 @@ impl TryFrom<proto::RecordedStep> for RecordedStep {
 
 impl From<RecordedStep> for proto::RecordedStep {
     fn from(step: RecordedStep) -> Self {
-        let RecordedStep { step, action, state, reward, success } = step;
-        Self { step, action: action.map(|values| proto::Action { values }), state, reward, success }
+        let RecordedStep { step, action, applied_action, state, reward, success } = step;
+        let [action, applied_action] =
+            [action, applied_action].map(|action| action.map(|values| proto::Action { values }));
+        Self { step, action, applied_action, state, reward, success }
     }
 }
 

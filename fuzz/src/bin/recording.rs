@@ -83,6 +83,7 @@ fn demonstration() -> Episode {
         step,
         frame: image(step as u8),
         action: (step < 2).then(|| vec![0.25, -1.0]),
+        applied_action: (step == 1).then(|| vec![0.5, 1.0]),
         state: vec![0.5],
         reward: 1.0,
         success: step == 2,

@@ -54,10 +54,12 @@ class Sample:
         """Writes the recording to its own path, or to another one."""
         path = dataset / (place or f"{self.task}/{self.episode_id}.mcap")
         path.parent.mkdir(parents=True, exist_ok=True)
-        actions = [*self.actions, np.ones(ACTION_SIZE, np.float32) if self.last_action else np.empty(0, np.float32)]
+        none = np.empty(0, np.float32)
+        actions = [*self.actions, np.ones(ACTION_SIZE, np.float32) if self.last_action else none]
+        applied = [-action if t % 2 else none for t, action in enumerate(actions)]  # Noise at every second step.
         digest = hashlib.sha256()
         for t, action in enumerate(actions):
-            for part in (self.frames[t], action, self.states[t], self.rewards[t], self.successes[t]):
+            for part in (self.frames[t], action, applied[t], self.states[t], self.rewards[t], self.successes[t]):
                 digest.update(part.tobytes())
         header = demonstration_pb2.RecordedEpisode(
             episode_id=self.episode_id,
@@ -84,6 +86,7 @@ class Sample:
                 step = demonstration_pb2.RecordedStep(
                     step=t,
                     action={"values": action} if len(action) else None,
+                    applied_action={"values": applied[t]} if len(applied[t]) else None,
                     state=self.states[t],
                     reward=self.rewards[t],
                     success=self.successes[t],

@@ -32,8 +32,8 @@ class Try:
     """False if the expert failed."""
 
 
-def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: int) -> None:
-    """Solves a variation and sends the episode, unless the trainer has stored it already.
+def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str, seed: int, noise: float) -> None:
+    """Solves a variation, with `noise` as in `solve`, and sends the episode, unless the trainer has stored it already.
 
     Raises:
         ExpertFailedError: If the expert does not solve the variation.
@@ -41,7 +41,8 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
         RequestError: If the trainer refuses the episode, or has stored it with another render spec.
         UnavailableError: If the trainer stays unavailable.
     """
-    episode_id = f"{task}-{seed}"
+    # Demonstrations with noise and without can be in one dataset.
+    episode_id = f"{task}-{seed}" + (f"-noise-{noise:g}" if noise else "")
     simulator.load(task)
     render_spec = str(simulator.render_spec)
     if is_recorded(session, episode_id, render_spec):
@@ -52,11 +53,12 @@ def demonstrate_episode(session: zenoh.Session, simulator: Simulator, task: str,
             step=number,
             frame=image_to_proto(simulator.frame(), render_spec),
             action=None if moment.action is None else action_to_proto(moment.action),
+            applied_action=None if moment.applied is None else action_to_proto(moment.applied),
             state=moment.arrival.state,
             reward=moment.arrival.reward,
             success=moment.arrival.success,
         )
-        for number, moment in enumerate(solve(simulator, task, seed))
+        for number, moment in enumerate(solve(simulator, task, seed, noise))
     ]
     episode = demonstration_pb2.RecordedEpisode(
         episode_id=episode_id,
@@ -85,7 +87,7 @@ def _run_tasks(
                     if seed >= FIRST_EVALUATION_SEED:
                         sys.exit(f"{task}: no demonstration seeds are left")
                     try:
-                        demonstrate_episode(session, simulator, task, seed)
+                        demonstrate_episode(session, simulator, task, seed, config.noise)
                         kept += 1
                         tries.put(Try(task, kept=True))
                     except ExpertFailedError:

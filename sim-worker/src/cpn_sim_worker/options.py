@@ -39,6 +39,9 @@ class DemonstrateConfig:
     """Number of successful episodes of each task."""
     first_seed: int = 0
     """Seed of the first variation; the next seed follows after each episode, solved or not."""
+    noise: float = 0
+    """Noise injection: probability that the actions of a segment of 4 to 8 steps are applied with a random displacement
+    of the hand added. A recording keeps the expert's actions, which a policy learns, and those that were applied."""
     processes: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
     """Number of processes, which share the tasks."""
     zenoh: ZenohConfig = field(default_factory=ZenohConfig)
@@ -48,6 +51,8 @@ class DemonstrateConfig:
             check_task(task)
         if not 0 <= self.first_seed < FIRST_EVALUATION_SEED:
             raise ValueError(f"first_seed: expected 0 to {FIRST_EVALUATION_SEED - 1}, got {self.first_seed}")
+        if not 0 <= self.noise < 1:
+            raise ValueError(f"noise: expected 0 to less than 1, got {self.noise}")
         for name in ("episodes", "processes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")

@@ -28,7 +28,7 @@ def digest(steps: Sequence[demonstration_pb2.DemonstrationStep]) -> str:
     for step in steps:
         hasher.update(step.frame.data)
         # A reward of -0 counts as 0, since not every encoder sends the sign.
-        for values in (step.action.values, step.state, [step.reward + 0.0]):
+        for values in (step.action.values, step.applied_action.values, step.state, [step.reward + 0.0]):
             hasher.update(np.array(values, "<f4").tobytes())
         hasher.update(bytes([step.success]))
     return hasher.hexdigest()

@@ -39,8 +39,17 @@ fn check(config: ModelConfig, losses: Losses, rows: i64, threads: usize) {
 
     let variables = Named(agent.variables().variables());
     let [xs, x_gs, ks, actions, masks] = [&x, &x_g, &steps_left(rows), &demonstrated, &mask].map(floats);
+    let applied_actions = floats(&batch.applied_actions);
     let next = next.map(floats).unwrap_or_default();
-    let samples = Samples { x: &xs, x_g: &x_gs, steps_left: &ks, actions: &actions, mask: &masks, next: &next };
+    let samples = Samples {
+        x: &xs,
+        x_g: &x_gs,
+        steps_left: &ks,
+        actions: &actions,
+        applied_actions: &applied_actions,
+        mask: &masks,
+        next: &next,
+    };
     let ours = OuterLoop::new(config.clone(), losses, threads).run(&variables, samples);
     let Named(variables) = variables;
 

@@ -42,6 +42,7 @@ fn batch(config: &ModelConfig, seed: u64) -> Batch {
         goals: vec![3, 3, 3, 2, 2, 3],
         steps_left: vec![3, 2, 1, 40, 60, 200],
         actions: floats(samples * config.actions as usize, seed + 1).collect(),
+        applied_actions: floats(samples * config.actions as usize, seed + 3).collect(),
         mask: floats(samples, seed + 2).map(|value| f32::from(value > -0.6)).collect(),
         next: if config.method.plans() { (0..samples).map(|i| i % 4).collect() } else { Vec::new() },
         positions: vec![[0.5, -1.0, 1.5]; 4],

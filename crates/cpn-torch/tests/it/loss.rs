@@ -18,6 +18,7 @@ fn batch(config: &ModelConfig, losses: Losses) -> Batch {
         goals: vec![6, 6, 6, 6, 6, 5, 4, 6],
         steps_left: vec![90, 75, 60, 45, 30, 15, 1, 200],
         actions: floats(samples * config.actions as usize, 3).collect(),
+        applied_actions: floats(samples * config.actions as usize, 5).collect(),
         mask: floats(samples, 4).map(|value| f32::from(value > -0.6)).collect(),
         next: if losses.dynamics > 0.0 { (0..samples).map(|i| i % 7).collect() } else { Vec::new() },
         positions: if losses.position > 0.0 { vec![[0.5, -1.0, 1.5]; 7] } else { Vec::new() },

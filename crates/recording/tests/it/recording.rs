@@ -21,6 +21,7 @@ fn steps(count: u32, side: u32, spec: &str) -> Vec<DemonstrationStep> {
             step,
             frame: Image::new(side, side, pixels).unwrap().rendered_as(spec).unwrap(),
             action: (step + 1 < count).then(|| vec![0.25, -1.0, step as f32 / 1000.0]),
+            applied_action: (step == 1 && step + 1 < count).then(|| vec![-0.25, 1.0, 0.5]),
             state: vec![step as f32, 0.5],
             reward: step as f32 * 0.1,
             success: step + 1 == count,
@@ -223,7 +224,7 @@ fn intact_files_without_a_valid_episode_are_refused() {
 #[test]
 fn inconsistent_steps_are_refused_with_the_field() {
     type Spoil = fn(&mut RecordedEpisode, &mut Vec<DemonstrationStep>);
-    let cases: [(Spoil, &str); 11] = [
+    let cases: [(Spoil, &str); 14] = [
         (|_, s| drop(s.pop()), "steps: expected 3, got 2"),
         (|i, s| (i.steps, *s) = (1, s[..1].to_vec()), "steps: expected at least 2, got 1"),
         (|_, s| s[1].step = 4, "steps[1].step: expected 1, got 4"),
@@ -238,6 +239,15 @@ fn inconsistent_steps_are_refused_with_the_field() {
         (|_, s| s[2].action = Some(vec![0.0; 3]), "steps[2].action: expected none at the goal frame, got an action"),
         (|_, s| s[1].action = Some(vec![0.0]), "steps[1].action: expected 3 values, got 1 values"),
         (|_, s| s[0].action.as_mut().unwrap()[0] = 1.5, "steps[0].action: expected values in [-1, 1], got 1.5"),
+        (
+            |_, s| s[2].applied_action = Some(vec![0.0; 3]),
+            "steps[2].applied_action: expected none at the goal frame, got an action",
+        ),
+        (|_, s| s[0].applied_action = Some(vec![0.0]), "steps[0].applied_action: expected 3 values, got 1 values"),
+        (
+            |_, s| s[0].applied_action = Some(vec![0.0, 0.0, -1.5]),
+            "steps[0].applied_action: expected values in [-1, 1], got -1.5",
+        ),
     ];
     for (spoil, expected) in cases {
         let mut steps = steps(3, 2, "spec");

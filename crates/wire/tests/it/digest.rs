@@ -12,6 +12,7 @@ fn steps() -> Vec<DemonstrationStep> {
             step: n,
             frame: Image::new(84, 84, pixels).unwrap(),
             action: (n < 2).then(|| vec![0.5, -0.25, n as f32, 1.0]),
+            applied_action: (n == 1).then(|| vec![-0.5, 0.25, -1.0, -1.0]),
             state: vec![n as f32 + 0.5, -1.0],
             reward: n as f32 * 0.125,
             success: n == 2,
@@ -30,9 +31,10 @@ fn the_digest_of_an_episode_matches_the_golden_one() {
 #[test]
 fn the_digest_depends_on_every_part_of_a_step() {
     let whole = digest(&steps());
-    let spoils: [fn(&mut DemonstrationStep); 5] = [
+    let spoils: [fn(&mut DemonstrationStep); 6] = [
         |step| step.frame = Image::new(84, 84, vec![0; 84 * 84 * 3]).unwrap(),
         |step| step.action.as_mut().unwrap()[2] += 0.5,
+        |step| step.applied_action = Some(vec![0.0; 4]),
         |step| step.state[1] = 1.0,
         |step| step.reward = 0.5,
         |step| step.success = true,

@@ -209,12 +209,13 @@ fn each_wrong_field_of_a_step_is_named() {
     };
     decode::<DemonstrationStep>(&good().encode_to_vec()).unwrap();
     type Spoil = fn(&mut proto::DemonstrationStep);
-    let cases: [(Spoil, &str, &str); 5] = [
+    let cases: [(Spoil, &str, &str); 6] = [
         (|s| s.step = 1000, "step", "1000"),
         (|s| s.state = vec![0.0; 1025], "state", "1025"),
         (|s| s.state[3] = f32::NAN, "state", "NaN"),
         (|s| s.reward = f32::NEG_INFINITY, "reward", "-inf"),
         (|s| s.action = Some(proto::Action { values: vec![0.0; 65] }), "action.values", "65"),
+        (|s| s.applied_action = Some(proto::Action { values: vec![0.0; 65] }), "applied_action.values", "65"),
     ];
     for (spoil, field, got) in cases {
         let mut step = good();

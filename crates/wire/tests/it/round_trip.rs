@@ -243,12 +243,12 @@ proptest! {
     fn demonstrations(
         episode in recorded(),
         frame in image(),
-        action in option::of(action()),
+        (action, applied_action) in (option::of(action()), option::of(action())),
         (state, reward, success) in (vec(-9.0f32..9.0, 0..40), -9.0f32..9.0, any::<bool>()),
         step in 0..MAX_STEPS,
         missing_steps in vec(any::<u32>(), 0..5),
     ) {
-        let recorded = RecordedStep { step, action, state, reward, success };
+        let recorded = RecordedStep { step, action, applied_action, state, reward, success };
         survives(recorded.clone());
 
         survives(recorded.with_frame(episode.episode_id.clone(), frame));

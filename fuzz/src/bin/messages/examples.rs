@@ -115,7 +115,14 @@ fn demonstrations() -> Vec<Example> {
         control_hz: 80.0,
         render_spec: r#"{"camera":"corner"}"#.into(),
     };
-    let step = RecordedStep { step: 3, action: Some(action()), state: vec![0.5; 4], reward: 0.5, success: true };
+    let step = RecordedStep {
+        step: 3,
+        action: Some(action()),
+        applied_action: Some(action()),
+        state: vec![0.5; 4],
+        reward: 0.5,
+        success: true,
+    };
     vec![
         example(step.clone().with_frame("reach-5".into(), image())),
         example(step),

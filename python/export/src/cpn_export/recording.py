@@ -131,7 +131,7 @@ def _digest(images: Sequence[Any], steps: Sequence[Any]) -> str:
     digest = hashlib.sha256()
     for image, step in zip(images, steps, strict=True):
         digest.update(image.data)
-        for values in (step.action.values, step.state, [step.reward]):
+        for values in (step.action.values, step.applied_action.values, step.state, [step.reward]):
             digest.update(np.array(values, "<f4").tobytes())
         digest.update(bytes([step.success]))
     return digest.hexdigest()

@@ -9,7 +9,7 @@ use recording::Episode as Recording;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wire::Error;
-use wire::demonstration::RecordedEpisode;
+use wire::demonstration::{DemonstrationStep, RecordedEpisode};
 
 /// Frames and actions of all episodes that are not held out.
 #[derive(Debug)]
@@ -19,6 +19,8 @@ pub struct Dataset {
     frames: Frames,
     /// Actions in the order of the episodes, `[actions, A]`.
     actions: Vec<f32>,
+    /// Applied actions: the same, or with noise added.
+    applied_actions: Vec<f32>,
     action_size: usize,
     /// Standardised position of the hand in each frame; empty if a step has none.
     hand_positions: Vec<[f32; 3]>,
@@ -95,9 +97,11 @@ impl Dataset {
         }
         let hand_positions: Option<Vec<_>> = read.iter().map(|steps| steps.hand_positions.as_deref()).collect();
         let hand_positions = standardised(hand_positions.unwrap_or_default().concat());
-        let actions = read.into_iter().flat_map(|steps| steps.actions).collect();
+        let (actions, applied_actions): (Vec<_>, Vec<_>) =
+            read.into_iter().map(|steps| (steps.actions, steps.applied_actions)).unzip();
+        let (actions, applied_actions) = (actions.concat(), applied_actions.concat());
         let digest = dataset_digest(&infos);
-        Ok(Self { frames, actions, action_size, hand_positions, episodes, infos, digest })
+        Ok(Self { frames, actions, applied_actions, action_size, hand_positions, episodes, infos, digest })
     }
 
     /// Names of the tasks, sorted.
@@ -144,9 +148,14 @@ impl Dataset {
         &self.hand_positions
     }
 
-    /// The `count` actions, `[count, A]`, from index `first` on.
-    pub fn actions(&self, first: usize, count: usize) -> &[f32] {
-        &self.actions[first * self.action_size..][..count * self.action_size]
+    /// Actions, `[actions, A]`.
+    pub fn actions(&self) -> &[f32] {
+        &self.actions
+    }
+
+    /// Actions that were applied, `[actions, A]`: the same, or with noise added.
+    pub fn applied_actions(&self) -> &[f32] {
+        &self.applied_actions
     }
 }
 
@@ -154,6 +163,8 @@ impl Dataset {
 struct Steps {
     /// `[T, A]`.
     actions: Vec<f32>,
+    /// `[T, A]`.
+    applied_actions: Vec<f32>,
     /// A.
     action_size: usize,
     /// Position of the hand at each step, the first three values of its state.
@@ -200,9 +211,11 @@ fn fill<T: Send>(
         let episode = folder::read(folder, path)?;
         copy(&episode, slot).with_context(|| path.display().to_string())?;
         let actions: Vec<f32> = episode.steps().iter().flat_map(|step| step.action.iter().flatten()).copied().collect();
+        let applied = |step: &DemonstrationStep| step.applied_action.clone().or_else(|| step.action.clone());
+        let applied_actions = episode.steps().iter().filter_map(applied).flatten().collect();
         let action_size = actions.len() / (episode.steps().len() - 1);
         let hand_positions = episode.steps().iter().map(|step| step.state.first_chunk().copied()).collect();
-        Ok(Steps { actions, action_size, hand_positions })
+        Ok(Steps { actions, applied_actions, action_size, hand_positions })
     };
     slots.into_par_iter().zip(paths).map(read).collect()
 }

@@ -111,6 +111,7 @@ impl<'a> Sampler<'a> {
         let (mut observations, mut goals) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         let mut actions = vec![0.0; samples.len() * horizon * size];
         let mut mask = vec![0.0; samples.len() * horizon];
+        let mut applied_actions = vec![0.0; if self.needs_next() { actions.len() } else { 0 }];
         let mut next = Vec::new();
 
         for (row, sample) in samples.iter().enumerate() {
@@ -120,10 +121,12 @@ impl<'a> Sampler<'a> {
             let episode = &self.dataset.episodes()[sample.episode as usize];
             for t in 0..horizon {
                 let at = row * horizon + t;
-                if self.block(episode, sample, t, &mut actions[at * size..][..size]) {
+                if self.block(self.dataset.actions(), episode, sample, t, &mut actions[at * size..][..size]) {
                     mask[at] = 1.0;
                 }
                 if self.needs_next() {
+                    let applied = &mut applied_actions[at * size..][..size];
+                    self.block(self.dataset.applied_actions(), episode, sample, t, applied);
                     let step = sample.step as usize + (t + 1) * self.training.action_block;
                     next.push(frames.row(sample.episode, sample.goal.min(step as u32)));
                 }
@@ -141,6 +144,7 @@ impl<'a> Sampler<'a> {
             goals,
             steps_left,
             actions,
+            applied_actions,
             mask,
             next,
             positions,
@@ -169,13 +173,14 @@ impl<'a> Sampler<'a> {
         }
     }
 
-    /// Target of planned action t: adds the mean of its block of demonstrated actions before the goal to `mean`; false if there is
-    /// none.
-    fn block(&self, episode: &Episode, sample: &Sample, t: usize, mean: &mut [f32]) -> bool {
+    /// Block t of `actions`, `[actions, A]`, after a sample's observation: adds the mean of its actions before the goal to `mean`;
+    /// false if there is none.
+    fn block(&self, actions: &[f32], episode: &Episode, sample: &Sample, t: usize, mean: &mut [f32]) -> bool {
         let block = self.training.action_block;
         let first = sample.step as usize + t * block;
         let count = block.min((sample.goal as usize).saturating_sub(first));
-        let actions = self.dataset.actions(episode.first_action + first.min(episode.action_count), count);
+        let first = episode.first_action + first.min(episode.action_count);
+        let actions = &actions[first * mean.len()..][..count * mean.len()];
         for action in actions.chunks_exact(mean.len()) {
             for (mean, value) in mean.iter_mut().zip(action) {
                 *mean += value / count as f32;

@@ -115,9 +115,9 @@ fn samples_drawn_together_share_frames() {
     assert_eq!((frames, episodes), (9, 1));
 }
 
-/// With a dynamics loss, samples drawn together are successive, and a batch has the frame after each of their actions.
+/// With a dynamics loss, samples drawn together are successive, and a batch has the applied actions and the frame after each.
 #[test]
-fn a_dynamics_loss_gets_the_frames_after_the_actions() {
+fn a_dynamics_loss_gets_the_applied_actions_and_the_frames_after_them() {
     let dataset = dataset();
     for block in [1, 3] {
         let recipe = recipe(|training| {
@@ -140,6 +140,16 @@ fn a_dynamics_loss_gets_the_frames_after_the_actions() {
             let recorded = step("reach", s.episode.into(), STEPS[s.episode as usize], after);
             let Observed::Image(pixels) = frames[*next] else { panic!("an image") };
             assert_eq!((pixels, *mask), (recorded.frame.data(), 1.0));
+
+            let applied = (s.step + t as u32 * block as u32..after).map(|number| {
+                let recorded = step("reach", s.episode.into(), STEPS[s.episode as usize], number);
+                recorded.applied_action.or(recorded.action).unwrap()
+            });
+            let applied: Vec<_> = applied.collect();
+            for i in 0..4 {
+                let mean = applied.iter().map(|action| action[i]).sum::<f32>() / applied.len() as f32;
+                assert!((batch.applied_actions[at * 4 + i] - mean).abs() < 1e-6);
+            }
         }
     }
 }

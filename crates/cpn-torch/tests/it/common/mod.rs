@@ -42,6 +42,7 @@ pub fn paired(observations: &Tensor, goals: &Tensor, actions: &Tensor, mask: &Te
         goals: rows(count),
         steps_left: steps_left(count),
         actions: actions.shallow_clone(),
+        applied_actions: actions.neg(),
         mask: mask.shallow_clone(),
         next: Tensor::zeros([0, actions.size()[1]], (Kind::Int64, Device::Cpu)),
         positions: Tensor::zeros([0, 3], (Kind::Float, Device::Cpu)),

@@ -1,4 +1,4 @@
-//! Dynamics loss of a block of samples: g_θ's predicted states under the demonstrated actions against the embeddings of the frames
+//! Dynamics loss of a block of samples: g_θ's predicted states under the applied actions against the embeddings of the frames
 //! that followed.
 
 use super::samples::Samples;
@@ -15,7 +15,7 @@ pub struct DynamicsLoss<T> {
     /// Tapes of the H steps.
     steps: Vec<StepTape<T>>,
     buffers: Buffers<T>,
-    /// Demonstrated actions of a step, then their gradient, which is not used, `[R, A]`.
+    /// Applied actions of a step, then their gradient, which is not used, `[R, A]`.
     action: Vec<T>,
     /// Gradients of the loss in the predicted states, `[H, R, Z]`.
     state_hat: Vec<T>,
@@ -56,7 +56,7 @@ impl<T: Element> DynamicsLoss<T> {
         let mut loss = T::ZERO;
         for (t, (step, hat)) in steps.iter_mut().zip(state_hat.chunks_mut(rows * latent)).enumerate() {
             for (r, action) in action.chunks_exact_mut(network.sizes.actions).enumerate() {
-                action.copy_from_slice(&samples.actions[(r * horizon + t) * action.len()..][..action.len()]);
+                action.copy_from_slice(&samples.applied_actions[(r * horizon + t) * action.len()..][..action.len()]);
             }
             network.features(rows, step, x, context);
             network.next(rows, step, action, x, buffers);

@@ -64,6 +64,7 @@ impl OuterLoss {
             x_g: &x_g,
             steps_left: &steps_left,
             actions: &batch.actions,
+            applied_actions: &batch.applied_actions,
             mask: &batch.mask,
             next: &next,
         };

@@ -13,6 +13,8 @@ pub struct Samples<'a, T> {
     pub steps_left: &'a [T],
     /// Demonstrated actions, `[R, H, A]`.
     pub actions: &'a [T],
+    /// Applied actions, `[R, H, A]`; empty without a dynamics loss.
+    pub applied_actions: &'a [T],
     /// Mask, `[R, H]`: 1 for an action within the demonstration, else 0.
     pub mask: &'a [T],
     /// Embeddings of the frames after the demonstrated actions, `[R, H, Z]`; empty without a dynamics loss.
@@ -37,6 +39,7 @@ impl<'a, T: Element> Samples<'a, T> {
             x_g: cut(self.x_g),
             steps_left: cut(self.steps_left),
             actions: cut(self.actions),
+            applied_actions: cut(self.applied_actions),
             mask: cut(self.mask),
             next: cut(self.next),
         }

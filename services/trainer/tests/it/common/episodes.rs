@@ -13,17 +13,22 @@ use wire::sim::Variation;
 /// Render spec of every frame.
 pub const SPEC: &str = r#"{"camera":"corner2"}"#;
 
-/// Step `step` of an episode: a random frame, and an action except at the end.
+/// Step `step` of an episode: a random frame, and an action except at the end; at every third step another one is applied.
 pub fn step(task: &str, seed: u64, steps: u32, step: u32) -> DemonstrationStep {
     let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + u64::from(step));
     let mut data = vec![0; images::BYTES];
     rng.fill_bytes(&mut data);
     let side = images::SIZE as u32;
+    let action: Option<Vec<f32>> = (step + 1 < steps).then(|| (0..4).map(|_| rng.random_range(-1.0..1.0)).collect());
     DemonstrationStep {
         episode_id: format!("{task}-{seed}"),
         step,
         frame: Image::new(side, side, data).unwrap().rendered_as(SPEC).unwrap(),
-        action: (step + 1 < steps).then(|| (0..4).map(|_| rng.random_range(-1.0..1.0)).collect()),
+        applied_action: action
+            .clone()
+            .filter(|_| step % 3 == 1)
+            .map(|action| action.iter().map(|value| -value).collect()),
+        action,
         state: vec![step as f32 * 0.01, 0.5, 0.2],
         reward: step as f32,
         success: step + 1 == steps,
