@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from mcap_protobuf.writer import Writer
 
 from cpn.v1 import demonstration_pb2, trial_pb2
-from cpn_client import Image, Planner, RefusedError, recorded_goal
+from cpn_client import Image, Planner, RefusedError, recorded_goal, recorded_observation
 
 SPEC = '{"camera":"corner4"}'
 
@@ -51,6 +51,28 @@ def test_recordings_without_a_frame_are_refused(tmp_path: Path) -> None:
         recorded_goal(record(tmp_path / "empty.mcap"))
     with pytest.raises(ValueError, match="frame: expected 84 x 84 pixels, got 42 x 42"):
         recorded_goal(record(tmp_path / "small.mcap", frame(Image.of(FRAME), 42)))
+
+
+def test_observation_is_the_first_frame(tmp_path: Path) -> None:
+    episode = demonstration_pb2.RecordedEpisode(render_spec=SPEC)
+    trial = trial_pb2.RecordedTrial(goal=Image(Image.of(GOAL).data, SPEC).to_proto())
+    frames = frame(Image.of(FRAME)), frame(Image.of(GOAL))
+    for first in (episode, trial):
+        path = record(tmp_path / "episode.mcap", ("/episode", first), *frames)
+        assert recorded_observation(path) == Image(Image.of(FRAME).data, SPEC)
+    with pytest.raises(ValueError, match="frame: expected 84 x 84 pixels, got none"):
+        recorded_observation(record(tmp_path / "empty.mcap"))
+
+
+def test_corrupt_recordings_are_refused(tmp_path: Path) -> None:
+    path = record(tmp_path / "demonstration.mcap", frame(Image.of(FRAME)), frame(Image.of(GOAL)))
+    data = path.read_bytes()
+    middle = len(data) // 2
+    flipped = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+    for corrupt in (b"", data[:10], data[:middle], flipped):
+        path.write_bytes(corrupt)
+        with pytest.raises(ValueError, match=f"^{path}: expected a recording, an MCAP file, got "):
+            recorded_goal(path)
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

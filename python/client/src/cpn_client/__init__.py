@@ -13,7 +13,7 @@ from cpn_client.errors import (
 from cpn_client.image import Image
 from cpn_client.plan import Goal, Model, Plan, Search, StageTimes
 from cpn_client.planner import AsyncPlanner, Planner
-from cpn_client.recording import recorded_goal
+from cpn_client.recording import recorded_goal, recorded_observation
 from cpn_client.transport import Tls
 
 __all__ = [
@@ -37,4 +37,5 @@ __all__ = [
     "connect",
     "connect_async",
     "recorded_goal",
+    "recorded_observation",
 ]
