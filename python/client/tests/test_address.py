@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import trustme
 from conftest import FRAME, GOAL, PlannerProcess, running
+from test_cli import Shell
 
 import cpn_client
 from cpn_client import RefusedError, Tls, UnreachableError
@@ -86,6 +87,14 @@ def test_token_lets_in(secure: Secure) -> None:
     for token in ("", "guessed"):
         with pytest.raises(RefusedError, match=r"^UNAUTHENTICATED: expected an answer, got authorization"):
             cpn_client.connect(secure.process.grpc, tls=Tls(secure.tls.ca), token=token)
+
+
+def test_command_line_is_let_in(secure: Secure, tmp_path: Path) -> None:
+    shell, tls = Shell(tmp_path, secure.process.grpc), secure.tls
+    options = ["--tls-ca", tls.ca, "--tls-certificate", str(tls.certificate), "--tls-private-key", str(tls.private_key)]
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    for let_in in (["--planner", secure.process.zenoh, *options], options, [*options[:2], "--token-file", "token"]):
+        assert "te-bc" in shell.output("models", *let_in)
 
 
 def test_faulty_files_are_named(secure: Secure, tmp_path: Path) -> None:
