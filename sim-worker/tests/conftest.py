@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from cpn_sim_worker import keys
-from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.render import process_renderer
 from cpn_sim_worker.session import ZenohConfig, open_session
 from cpn_sim_worker.simulator import Simulator
 from tests.support import COMMAND, READY_SECONDS, Log, StartWorker, collect, free_endpoint, wait_for_sample
@@ -25,8 +25,8 @@ def _no_options_from_outside() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def simulator() -> Simulator:
-    """Simulator of the session: a process can have only one renderer."""
-    return Simulator(Renderer())
+    """Simulator of the session, with the only renderer that a process can have."""
+    return Simulator(process_renderer())
 
 
 @pytest.fixture(scope="session")

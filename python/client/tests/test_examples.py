@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import pytest
 from conftest import FRAME, GOAL, ROOT, PlannerProcess
 
 UV = os.environ.get("UV", "uv")
@@ -19,7 +20,8 @@ def test_plan_is_printed_over_either_transport(process: PlannerProcess) -> None:
         assert "of 5 planned actions" in output(sys.executable, "examples/plan.py", str(GOAL), str(FRAME), address)
 
 
-def test_task_is_solved_in_closed_loop(process: PlannerProcess) -> None:
+@pytest.mark.parametrize("example", ["closed_loop", "gymnasium_loop"])
+def test_task_is_solved_in_closed_loop(process: PlannerProcess, example: str) -> None:
     environment = ["--quiet", "--project", "sim-worker", "--with-editable", "python/client"]
-    task = ["examples/closed_loop.py", "plate-slide", "1000000", process.zenoh]
+    task = [f"examples/{example}.py", "plate-slide", "1000000", process.zenoh]
     assert output(UV, "run", *environment, *task).startswith("plate-slide solved after ")

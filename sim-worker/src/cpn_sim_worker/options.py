@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass, field
 
 from cpn_sim_worker.session import ZenohConfig
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS, check_task
+from cpn_sim_worker.tasks import EPISODE_STEPS, FIRST_EVALUATION_SEED, TASKS, check_task
 
 MAX_STEPS = 500
 """Largest step limit: Meta-World's environments refuse further steps, unlike Jenga."""
@@ -16,7 +16,7 @@ class ServeConfig:
 
     worker: str = "w0"
     """Name of the worker in its zenoh keys."""
-    max_steps: int = 150
+    max_steps: int = EPISODE_STEPS
     """Maximum number of steps of an episode."""
     zenoh: ZenohConfig = field(default_factory=ZenohConfig)
 

@@ -5,6 +5,7 @@
 
 import copy
 from dataclasses import asdict
+from functools import cache
 from typing import ClassVar
 
 import mujoco
@@ -109,3 +110,14 @@ class Renderer:
         # the right.
         flipped = pixels[::-1] if scene.camera.flip == "rows" else pixels[:, ::-1]
         return np.ascontiguousarray(flipped)
+
+
+@cache
+def process_renderer() -> Renderer:
+    """Renderer of the process, made by the first call, for several simulators that take turns.
+
+    Raises:
+        OpenGLError: If OpenGL is missing or does not draw.
+        RuntimeError: If the process has made another.
+    """
+    return Renderer()

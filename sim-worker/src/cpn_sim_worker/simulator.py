@@ -10,11 +10,14 @@ from cpn_sim_worker.scene import Scene, Transition
 from cpn_sim_worker.tasks import TASKS, check_task
 
 
-def _load(task: str) -> Scene:
+def scene_type(task: str) -> type[MetaWorldScene | JengaScene]:
+    """Class of the scene of `task`.
+
+    Raises:
+        UnknownTaskError: If the task is unknown.
+    """
     check_task(task)
-    if task in TASKS:
-        return MetaWorldScene(task)
-    return JengaScene(task)
+    return MetaWorldScene if task in TASKS else JengaScene
 
 
 class Simulator:
@@ -32,7 +35,7 @@ class Simulator:
             MissingExtraError: If the task needs an extra that is not installed.
         """
         if task != self._task:
-            self.scene = _load(task)
+            self.scene: Scene = scene_type(task)(task)
             self.render_spec = self._renderer.spec(self.scene)
             self._task = task
 

@@ -31,6 +31,9 @@ TASKS = (
 
 JENGA_TASKS = ("jenga-poke", "jenga-poke-offset")
 
+EPISODE_STEPS = 150
+"""Step limit of an episode, unless another is given."""
+
 # Demonstrations use the seeds below, evaluation this one and those above, so that no variation is used by both.
 FIRST_EVALUATION_SEED = 1_000_000
 
