@@ -7,6 +7,7 @@ WORKER := sim-worker/.venv
 EXAMPLES := examples/.venv
 CLIENT := python/client/.venv
 EXPORT := python/export/.venv
+LEROBOT := python/lerobot/.venv
 BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
@@ -22,7 +23,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-adapters test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -53,6 +54,10 @@ $(CLIENT)/.ready: python/client/pyproject.toml python/client/uv.lock $(MESSAGES)
 
 $(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock $(MESSAGES) | $(UV)
 	cd python/export && $(UV) sync --quiet --locked
+	touch $@
+
+$(LEROBOT)/.ready: python/lerobot/pyproject.toml python/lerobot/uv.lock python/client/pyproject.toml $(MESSAGES) | $(UV)
+	cd python/lerobot && $(UV) sync --quiet --locked
 	touch $@
 
 $(BENCH)/.ready: python/bench-peers/pyproject.toml python/bench-peers/uv.lock | $(UV)
@@ -152,6 +157,10 @@ test-client: setup $(CLIENT)/.ready ## Run the Python client against planners th
 	cargo build --workspace --locked --bin cpn-planner
 	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
 
+test-adapters: setup $(LEROBOT)/.ready ## Run the policies for other frameworks in those, unmodified, against a planner
+	cargo build --workspace --locked --bin cpn-planner
+	cd python/lerobot && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
+
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
 	cd tests/stack && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest $(if $(ONLY),-k "$(ONLY)")
@@ -212,4 +221,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
+	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(LEROBOT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
