@@ -7,11 +7,11 @@ WORKER := sim-worker/.venv
 EXAMPLES := examples/.venv
 CLIENT := python/client/.venv
 EXPORT := python/export/.venv
-LEROBOT := python/lerobot/.venv
 BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
+ADAPTERS := $(addprefix python/,lerobot stable-worldmodel)
 EXPERIMENT := experiments/leave_one_out/.venv
 # Sources of cpn-messages, a dependency of several environments.
 MESSAGES := python/messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
@@ -56,8 +56,8 @@ $(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock $(MESSAGES)
 	cd python/export && $(UV) sync --quiet --locked
 	touch $@
 
-$(LEROBOT)/.ready: python/lerobot/pyproject.toml python/lerobot/uv.lock python/client/pyproject.toml $(MESSAGES) | $(UV)
-	cd python/lerobot && $(UV) sync --quiet --locked
+$(ADAPTERS:%=%/.venv/.ready): %/.venv/.ready: %/pyproject.toml %/uv.lock python/client/pyproject.toml sim-worker/pyproject.toml $(MESSAGES) | $(UV)
+	cd $* && $(UV) sync --quiet --locked
 	touch $@
 
 $(BENCH)/.ready: python/bench-peers/pyproject.toml python/bench-peers/uv.lock | $(UV)
@@ -157,9 +157,11 @@ test-client: setup $(CLIENT)/.ready ## Run the Python client against planners th
 	cargo build --workspace --locked --bin cpn-planner
 	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
 
-test-adapters: setup $(LEROBOT)/.ready ## Run the policies for other frameworks in those, unmodified, against a planner
+test-adapters: setup $(ADAPTERS:%=%/.venv/.ready) ## Run the policies for other frameworks in those, unmodified, against a planner
 	cargo build --workspace --locked --bin cpn-planner
-	cd python/lerobot && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
+	for adapter in $(ADAPTERS); do \
+		(cd $$adapter && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest) || exit 1; \
+	done
 
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
@@ -221,4 +223,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(LEROBOT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(EXPERIMENT) .libtorch
+	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch
