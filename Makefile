@@ -11,7 +11,7 @@ BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
-ADAPTERS := $(addprefix python/,lerobot stable-worldmodel)
+ADAPTERS := $(addprefix python/,lerobot stable-worldmodel vla-eval)
 EXPERIMENT := experiments/leave_one_out/.venv
 # Sources of cpn-messages, a dependency of several environments.
 MESSAGES := python/messages/pyproject.toml $(wildcard proto/cpn/v1/*.proto)
