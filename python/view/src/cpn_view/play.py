@@ -13,7 +13,7 @@ from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from cpn_view.error import ViewError
-from cpn_view.recorded import KINDS
+from cpn_view.recorded import KINDS, Kind
 
 OpenStream = Callable[[str, str], AbstractContextManager[rr.RecordingStream]]
 """Function that opens a stream of an application, with the identifier of its recording."""
@@ -72,7 +72,9 @@ def play_recording(path: Path, open_stream: OpenStream) -> None:
         stream.set_log_tick_enabled(False)
         stream.send_recording_name(kind.title(header.message))
         stream.send_blueprint(
-            rrb.Blueprint(kind.views, rrb.TimePanel(timeline="time"), rrb.SelectionPanel(state="hidden"))
+            rrb.Blueprint(
+                kind.views, rrb.TimePanel(timeline="time", state="collapsed"), rrb.SelectionPanel(state="hidden")
+            )
         )
         try:
             kind.header(stream, header.message)
@@ -83,6 +85,12 @@ def play_recording(path: Path, open_stream: OpenStream) -> None:
                     show(stream, entry.message)
         except ValueError as error:
             raise ViewError(f"{path}: {error}") from error
+
+
+def _blueprint(kind: Kind) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        kind.views, rrb.TimePanel(timeline="time", state="collapsed"), rrb.SelectionPanel(state="hidden")
+    )
 
 
 def _entries(path: Path) -> Iterator[Entry]:

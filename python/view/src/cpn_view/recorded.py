@@ -53,13 +53,14 @@ def _trial_title(trial: Any) -> str:
 def _trial(stream: rr.RecordingStream, trial: Any) -> None:
     stream.log("goal", panels.image(trial.goal.data, trial.goal.height, trial.goal.width), static=True)
     lines = [
-        f"# {trial.variation.task}, seed {trial.variation.seed}",
-        f"- model: {trial.model}",
-        f"- checkpoint: {trial.model_digest[:12] or 'none'}",
-        f"- {trial.steps} actions, {trial.plans} plans",
+        f"{trial.variation.task}, seed {trial.variation.seed}",
+        f"model {trial.model} {trial.model_digest[:12]}",
+        f"{trial.steps} actions, {trial.plans} plans",
     ]
-    stream.log("trial", rr.TextDocument("\n".join(lines), media_type="text/markdown"), static=True)
+    stream.log("trial", rr.TextDocument("\n".join(lines)), static=True)
     _series(stream, "plan/first_action", list(panels.ACTION_NAMES), *panels.ACTION_COLORS)
+    for name, color in zip(panels.ACTION_NAMES, panels.ACTION_COLORS, strict=True):
+        _series(stream, f"plan/actions/{name}", [name], color)
     _series(stream, "plan/inner_loss", ["before the search", "of the plan"], BROWN, BLUE)
     _series(stream, "plan/latent_distance", ["latent distance"], RED)
     _series(stream, "plan/times_ms", ["queue", "encode", "plan"], BROWN, GREEN, BLUE)
@@ -73,7 +74,7 @@ def _plan(stream: rr.RecordingStream, plan: Any) -> None:
         stream.log(f"plan/actions/{name}", rr.Scalars(values))
     if plan.inner_losses:
         stream.log("plan/inner_loss", rr.Scalars([plan.inner_losses[0], plan.inner_losses[-1]]))
-        stream.log("plan/inner_losses", rr.BarChart(plan.inner_losses))
+        stream.log("plan/inner_losses", rr.BarChart(plan.inner_losses, color=BLUE))
     if plan.HasField("latent_distance"):
         stream.log("plan/latent_distance", rr.Scalars(plan.latent_distance))
     times = (plan.times.queue_seconds, plan.times.encode_seconds, plan.times.plan_seconds)
@@ -86,11 +87,15 @@ def _trial_views() -> rrb.Container:
             rrb.Spatial2DView(origin="goal", name="goal"),
             rrb.Spatial2DView(origin="camera", name="camera"),
             rrb.TextDocumentView(origin="trial", name="trial"),
-            row_shares=[3, 3, 1],
+            row_shares=[3, 3, 1.3],
         ),
         rrb.Vertical(
             rrb.TimeSeriesView(origin="plan/first_action", name="action to apply"),
-            rrb.TimeSeriesView(origin="plan/actions", name="planned actions, horizon long"),
+            rrb.TimeSeriesView(
+                origin="plan/actions",
+                name="planned actions, one line for each step of the horizon",
+                plot_legend=rrb.PlotLegend(visible=False),
+            ),
             rrb.TimeSeriesView(origin="plan/latent_distance", name="latent distance to the goal"),
         ),
         rrb.Vertical(
@@ -108,10 +113,10 @@ def _demonstration_title(episode: Any) -> str:
 
 def _demonstration(stream: rr.RecordingStream, episode: Any) -> None:
     lines = [
-        f"# {episode.variation.task}, seed {episode.variation.seed}",
-        f"- {episode.steps} steps, at {episode.control_hz:g} Hz",
+        f"{episode.variation.task}, seed {episode.variation.seed}",
+        f"{episode.steps} steps, at {episode.control_hz:g} Hz",
     ]
-    stream.log("demonstration", rr.TextDocument("\n".join(lines), media_type="text/markdown"), static=True)
+    stream.log("demonstration", rr.TextDocument("\n".join(lines)), static=True)
     _series(stream, "action", list(panels.ACTION_NAMES), *panels.ACTION_COLORS)
     _series(stream, "reward", ["reward"], BLUE)
     _series(stream, "success", ["success"], GREEN)

@@ -67,18 +67,28 @@ def open_session(options: ZenohConfig) -> zenoh.Session:
         raise ViewError(f"--mode (CPN_MODE): expected peer or client, got {options.mode!r}")
     if not options.endpoints and options.zenoh_config is None:
         raise ViewError("--connect (CPN_CONNECT): expected an endpoint of the network, got none")
+    _require_files(options, "zenoh_config", "password_file", "tls_ca", "tls_certificate", "tls_private_key")
+    settings = _settings(options)
     try:
-        # Zenoh reports a faulty file only as a router that does not answer.
-        settings = _settings(options)
         config = zenoh.Config.from_file(options.zenoh_config) if options.zenoh_config else zenoh.Config()
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
-    except OSError as error:
-        raise ViewError(f"zenoh: expected files that can be read, got {error}") from None
     except zenoh.ZError as error:
         reason = re.sub(r"\s+at /\S+:\d+\.?", "", str(error))
-        raise ViewError(f"zenoh: expected a network at {options.connect}, got {reason}") from None
+        raise ViewError(
+            f"zenoh: expected a network at {options.connect or options.zenoh_config}, got {reason}"
+        ) from None
+
+
+def _require_files(options: ZenohConfig, *names: str) -> None:
+    for name in names:
+        path: Path | None = getattr(options, name)
+        try:
+            if path:
+                path.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ViewError(f"--{name.replace('_', '-')}: expected a file that can be read, got {error}") from None
 
 
 def _settings(options: ZenohConfig) -> dict[str, object]:
@@ -111,8 +121,13 @@ def _tls(options: ZenohConfig) -> dict[str, object]:
     ca, certificate, private_key = (str(file) if file else "" for file in files)
     if not all(files):
         raise ViewError("--tls-ca, --tls-certificate, --tls-private-key: expected all or none, got some")
-    # An empty password, since OpenSSL would prompt on the terminal.
-    ssl.create_default_context(cafile=ca).load_cert_chain(certificate, private_key, password="")
+    try:
+        # Zenoh reports a faulty file only as a router that does not answer.
+        # An empty password, since OpenSSL would prompt on the terminal.
+        ssl.create_default_context(cafile=ca).load_cert_chain(certificate, private_key, password="")
+    except ssl.SSLError as error:
+        expected = "an authority, a certificate and its key"
+        raise ViewError(f"--tls-ca, --tls-certificate, --tls-private-key: expected {expected}, got {error}") from None
     # A single thread, since zenoh's TLS links read and write one stream from two threads at once, which corrupts memory
     # sooner or later (eclipse-zenoh/zenoh#2557). Zenoh reads this when its first session is opened.
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), tx: (handover: rx))")

@@ -1,0 +1,201 @@
+import logging
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import psutil
+import pytest
+import rerun as rr
+import zenoh
+from google.protobuf.message import Message
+
+from cpn.v1 import sim_pb2, types_pb2
+from cpn_view.live import QUEUE_LENGTH, LiveView
+from cpn_view.viewer import ViewerConfig, serve
+from tests.support import (
+    WAIT_SECONDS,
+    Network,
+    action,
+    actions,
+    blueprints,
+    frames,
+    free_port,
+    pictures,
+    rows,
+    scalars,
+    texts,
+    wait_for,
+)
+
+WORKER = os.environ.get("CPN_SIM_WORKER", Path(__file__).parents[3] / "sim-worker/.venv/bin/cpn-sim-worker")
+MIB = 1 << 20
+
+M = TypeVar("M", bound=Message)
+
+# A file that is still written to has no footer.
+pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
+
+
+@pytest.fixture
+def stream(rrd: Path) -> Iterator[rr.RecordingStream]:
+    """Stream into the file."""
+    stream = rr.RecordingStream("cpn-view-test")
+    stream.save(rrd)
+    yield stream
+    stream.disconnect()
+
+
+@pytest.fixture
+def view(watcher: zenoh.Session, stream: rr.RecordingStream) -> LiveView:
+    return LiveView(watcher, stream)
+
+
+Shown = Callable[[Callable[[], object]], None]
+
+
+@pytest.fixture
+def shown(view: LiveView, stream: rr.RecordingStream) -> Shown:
+    """Function that polls the view until the condition holds for the file."""
+
+    def wait(condition: Callable[[], object]) -> None:
+        def polled() -> object:
+            view.poll()
+            stream.flush()
+            return condition()
+
+        wait_for(polled)
+
+    return wait
+
+
+def frame_of(**image: Any) -> sim_pb2.Frame:  # noqa: ANN401
+    return sim_pb2.Frame(image=types_pb2.Image(**image))
+
+
+def test_two_workers(network: Network, shown: Shown, rrd: Path) -> None:
+    values = actions(4, 4)
+    for step in range(4):
+        for worker, seed in (("w0", 0), ("w1", 1)):
+            if step:
+                network.action(worker, step - 1, values[step - 1])
+            network.frame(worker, step, frames(4, seed)[step])
+        shown(lambda: len(pictures(rrd, "/workers/w0/camera")) == len(pictures(rrd, "/workers/w1/camera")) == step + 1)  # noqa: B023
+    for worker, seed in (("w0", 0), ("w1", 1)):
+        np.testing.assert_array_equal(pictures(rrd, f"/workers/{worker}/camera"), frames(4, seed))
+        np.testing.assert_array_equal(scalars(rrd, f"/workers/{worker}/action"), values[:3])
+        assert texts(rrd, f"/workers/{worker}/episode") == [f"reach-0-ab, step {step}" for step in range(4)]
+
+
+def test_gap_between_episodes(network: Network, shown: Shown, rrd: Path) -> None:
+    for episode in ("a", "b"):
+        for step in range(2):
+            network.action("w0", step, actions(4), episode)
+    shown(lambda: len(scalars(rrd, "/workers/w0/action")) == 4)
+    assert ["Clear:is_recursive" in row for row in rows(rrd, "/workers/w0/action")] == [
+        True,
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_slow_view_shows_the_present(network: Network, watcher: zenoh.Session, shown: Shown, rrd: Path) -> None:
+    last = 10 * QUEUE_LENGTH
+    with watcher.declare_subscriber("cpn/@v1/sim/w0/frame") as arrivals:
+        for step in range(last + 1):
+            network.action("w0", step, np.array([step], np.float32))
+            network.frame("w0", step, frames(1)[0])
+            arrivals.recv()
+    shown(lambda: texts(rrd, "/workers/w0/episode"))
+    assert texts(rrd, "/workers/w0/episode") == [f"reach-0-ab, step {last}"]
+    np.testing.assert_array_equal(scalars(rrd, "/workers/w0/action")[:, 0], range(last - QUEUE_LENGTH + 1, last + 1))
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (types_pb2.Action(values=[1]), "dropped a message at cpn/@v1/sim/w0/frame: "),
+        (frame_of(height=2, width=2, format="PIXEL_FORMAT_RGB8", data=b"123"), "expected 2 x 2 x 3 bytes, got 3"),
+        (frame_of(height=0, width=0), "image.format: expected RGB8, got 0"),
+    ],
+)
+def test_faulty_message(
+    network: Network, shown: Shown, rrd: Path, caplog: pytest.LogCaptureFixture, message: Message, reason: str
+) -> None:
+    network.session.put("cpn/@v1/sim/w0/frame", message.SerializeToString())
+    shown(lambda: reason in caplog.text)
+    network.frame("w0", 0, frames(1)[0])
+    shown(lambda: len(pictures(rrd, "/workers/w0/camera")) == 1)
+
+
+def test_workers_come_and_go(network: Network, shown: Shown, rrd: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    token = network.alive("w0")
+    shown(lambda: blueprints(rrd) == 2)
+
+    token.undeclare()
+    shown(lambda: texts(rrd, "/workers/w0/episode") == ["The worker is gone."])
+    network.alive("w0")
+    shown(lambda: caplog.text.count("worker w0 is here") == 2)
+    assert blueprints(rrd) == 2, "a restarted worker keeps its panel"
+
+    network.alive("w1")
+    shown(lambda: blueprints(rrd) == 3)
+
+
+def test_simulator_worker(network: Network, shown: Shown, rrd: Path) -> None:
+    command = [str(WORKER), "serve", "--worker", "real", "--connect", network.endpoint]
+    with subprocess.Popen(command) as process:
+        try:
+            shown(lambda: blueprints(rrd) == 2)
+            request = sim_pb2.ResetRequest(variation={"task": "reach", "seed": 0})
+            reset = ask(network, "reset", request, sim_pb2.ResetResponse)
+            images = [reset.observation.data]
+            for step, values in enumerate(actions(5, 4)):
+                shown(lambda: len(pictures(rrd, "/workers/real/camera")) == step + 1)  # noqa: B023
+                request = sim_pb2.StepRequest(episode_id=reset.episode_id, step=step, action=action(values))
+                images.append(ask(network, "step", request, sim_pb2.StepResponse).observation.data)
+            shown(lambda: len(pictures(rrd, "/workers/real/camera")) == 6)
+        finally:
+            process.terminate()
+    assert [picture.tobytes() for picture in pictures(rrd, "/workers/real/camera")] == images
+    np.testing.assert_array_equal(scalars(rrd, "/workers/real/action"), actions(5, 4))
+    assert texts(rrd, "/workers/real/episode")[-1] == f"{reset.episode_id}, step 5"
+
+
+def ask(network: Network, method: str, request: Message, response_type: type[M]) -> M:
+    (reply,) = network.session.get(
+        f"cpn/@v1/sim/real/{method}", payload=request.SerializeToString(), timeout=WAIT_SECONDS
+    )
+    assert reply.ok, reply.err and reply.err.payload.to_string()
+    response = response_type()
+    response.ParseFromString(reply.ok.payload.to_bytes())
+    return response
+
+
+def test_memory_is_bounded(network: Network, watcher: zenoh.Session) -> None:
+    config = ViewerConfig(port=free_port(2), memory_limit_mib=16)
+    with serve(config) as viewer, viewer.stream("cpn-view-test", "memory") as stream:
+        view = LiveView(watcher, stream)
+        images = frames(50)
+        processes = psutil.Process(), psutil.Process(viewer.process.pid)
+
+        def push(count: int) -> int:
+            """Shows frames, each different; returns the resident memory of both processes, in bytes."""
+            for number in range(count):
+                images[number % 50] += 1
+                with watcher.declare_subscriber("cpn/@v1/sim/w0/frame") as arrivals:
+                    network.frame("w0", number, images[number % 50])
+                    arrivals.recv()
+                view.poll()
+            stream.flush()
+            return sum(process.memory_info().rss for process in processes)
+
+        warm = push(2000)
+        # 5000 frames are 100 MiB.
+        assert push(5000) < warm + 40 * MIB
