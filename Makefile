@@ -7,6 +7,7 @@ WORKER := sim-worker/.venv
 EXAMPLES := examples/.venv
 CLIENT := python/client/.venv
 EXPORT := python/export/.venv
+VIEW := python/view/.venv
 BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
 KUBERNETES := tests/kubernetes/.venv
@@ -23,7 +24,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot test test-crash test-swap test-soak test-export test-client test-adapters test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -58,6 +59,10 @@ $(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock $(MESSAGES)
 
 $(ADAPTERS:%=%/.venv/.ready): %/.venv/.ready: %/pyproject.toml %/uv.lock python/client/pyproject.toml sim-worker/pyproject.toml $(MESSAGES) | $(UV)
 	cd $* && $(UV) sync --quiet --locked
+	touch $@
+
+$(VIEW)/.ready: python/view/pyproject.toml python/view/uv.lock $(MESSAGES) | $(UV)
+	cd python/view && $(UV) sync --quiet --locked
 	touch $@
 
 $(BENCH)/.ready: python/bench-peers/pyproject.toml python/bench-peers/uv.lock | $(UV)
@@ -122,6 +127,10 @@ sign-models: | $(UV) ## Sign the shipped checkpoints (KEY=private key in PEM), a
 export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDataset (DATASET=folder, OUT=folder)
 	$(EXPORT)/bin/cpn-export-lerobot --dataset $(or $(DATASET),data/demonstrations) --out $(or $(OUT),data/lerobot)
 
+view: export CPN_CONNECT := $(or $(CPN_CONNECT),tcp/127.0.0.1:7447)
+view: $(VIEW)/.ready ## Show the simulators of a running system in the browser, and print the address (CPN_CONNECT=endpoint, CPN_NAMESPACE=prefix)
+	$(VIEW)/bin/cpn-view live
+
 bases: ## Make local images under the names of the public base images, where no image registry is reachable
 	deploy/bases/make.sh
 
@@ -162,6 +171,9 @@ test-adapters: setup $(ADAPTERS:%=%/.venv/.ready) ## Run the policies for other 
 	for adapter in $(ADAPTERS); do \
 		(cd $$adapter && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest) || exit 1; \
 	done
+
+test-view: system $(WORKER)/.ready $(VIEW)/.ready ## Watch workers and play recordings, and hold what Rerun is sent to what was published
+	cd python/view && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-stack: $(STACK)/.ready ## Break the containers in every way while they evaluate: the results stay the same (ONLY=expression)
 	if docker info >/dev/null 2>&1; then $(COMPOSE) build; fi
@@ -223,4 +235,4 @@ format: setup ## Lay out all code
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch
+	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(VIEW) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch

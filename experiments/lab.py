@@ -151,6 +151,7 @@ def evaluate_shipped(out: Path, models: Iterable[str], tasks: Iterable[str], tri
         lab.planner(ROOT / "models")
         for worker in ("w0", "w1"):
             lab.worker(worker)
+        print(f"To watch: CPN_CONNECT={lab.endpoint} CPN_NAMESPACE={os.environ['CPN_NAMESPACE']} make view", flush=True)
         options = ["--models", ",".join(models), "--tasks", ",".join(tasks), "--trials", str(trials)]
         lab.evaluate("--workers", "2", *options, "--out", str(out))
 

@@ -1,3 +1,4 @@
+import json
 import logging
 import os
 import subprocess
@@ -13,7 +14,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from cpn.v1 import sim_pb2, types_pb2
-from cpn_view.live import QUEUE_LENGTH, LiveView
+from cpn_view.live import ACTIONS, ALIVE, FRAMES, QUEUE_LENGTH, LiveView
 from cpn_view.viewer import ViewerConfig, serve
 from tests.support import (
     WAIT_SECONDS,
@@ -30,7 +31,8 @@ from tests.support import (
     wait_for,
 )
 
-WORKER = os.environ.get("CPN_SIM_WORKER", Path(__file__).parents[3] / "sim-worker/.venv/bin/cpn-sim-worker")
+ROOT = Path(__file__).parents[3]
+WORKER = os.environ.get("CPN_SIM_WORKER", ROOT / "sim-worker/.venv/bin/cpn-sim-worker")
 MIB = 1 << 20
 
 M = TypeVar("M", bound=Message)
@@ -73,6 +75,12 @@ def shown(view: LiveView, stream: rr.RecordingStream) -> Shown:
 
 def frame_of(**image: Any) -> sim_pb2.Frame:  # noqa: ANN401
     return sim_pb2.Frame(image=types_pb2.Image(**image))
+
+
+def test_keys() -> None:
+    golden = json.loads((ROOT / "tests/golden/keys.json").read_text())
+    for name, key in {"sim_frame": FRAMES, "sim_action": ACTIONS, "sim_alive": ALIVE}.items():
+        assert golden[name]["key"] == key.replace("*", "w0")
 
 
 def test_two_workers(network: Network, shown: Shown, rrd: Path) -> None:

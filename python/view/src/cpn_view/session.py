@@ -12,8 +12,8 @@ import zenoh
 
 from cpn_view.error import ViewError
 
-MAX_MESSAGE_BYTES = 1 << 20
-"""Largest message after defragmentation, as of every message that a simulator worker publishes."""
+MAX_MESSAGE_BYTES = 2 << 20
+"""Largest message after defragmentation: that of a worker, 1 MiB, with a margin for its head."""
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 """Pauses between attempts to connect."""
 
