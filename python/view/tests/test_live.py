@@ -95,6 +95,7 @@ def test_two_workers(network: Network, shown: Shown, rrd: Path) -> None:
         np.testing.assert_array_equal(pictures(rrd, f"/workers/{worker}/camera"), frames(4, seed))
         np.testing.assert_array_equal(scalars(rrd, f"/workers/{worker}/action"), values[:3])
         assert texts(rrd, f"/workers/{worker}/episode") == [f"reach-0-ab, step {step}" for step in range(4)]
+    assert blueprints(rrd) <= 3, "a blueprint without workers, and one for each that came"
 
 
 def test_gap_between_episodes(network: Network, shown: Shown, rrd: Path) -> None:

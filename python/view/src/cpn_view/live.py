@@ -70,37 +70,40 @@ class LiveView:
 
     def poll(self) -> None:
         """Shows the samples that wait."""
-        for sample in _waiting(self._tokens):
-            self._presence(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
         for sample in _waiting(self._actions):
             self._show(sample, sim_pb2.AppliedAction, self._action)
         latest = {str(sample.key_expr): sample for sample in _waiting(self._frames)}
         for sample in latest.values():
             self._show(sample, sim_pb2.Frame, self._frame)
+        # Last, so that no frame of a worker that is gone comes after its token.
+        for sample in _waiting(self._tokens):
+            worker = str(sample.key_expr).rpartition("/")[2]
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._come(worker)
+            else:
+                self._go(worker)
 
-    def _presence(self, worker: str, alive: bool) -> None:
-        if alive:
+    def _come(self, worker: str) -> None:
+        if worker not in self._alive:
             log.info("worker %s is here", worker)
             self._alive.add(worker)
-            self._add_panel(worker)
-        else:
-            log.info("worker %s is gone", worker)
-            self._alive.discard(worker)
-            self._episodes.pop(worker, None)
-            self._stream.log(_entity(worker, "episode"), rr.TextDocument("The worker is gone."))
-
-    def _add_panel(self, worker: str) -> None:
-        """Adds a panel. Those of workers that are gone stay until then, so that a restarted worker changes nothing."""
+        # Panels of workers that are gone stay until another comes, so that a restarted worker changes nothing.
         if worker not in self._shown:
-            self._shown = self._alive | {worker}
+            self._shown = set(self._alive)
             self._stream.send_blueprint(_blueprint(self._shown))
+
+    def _go(self, worker: str) -> None:
+        log.info("worker %s is gone", worker)
+        self._alive.discard(worker)
+        self._episodes.pop(worker, None)
+        self._stream.log(_entity(worker, "episode"), rr.TextDocument("The worker is gone."))
 
     def _show(self, sample: zenoh.Sample, message_type: type[M], show: Callable[[str, M], None]) -> None:
         worker = str(sample.key_expr).split("/")[-2]
         try:
             message = message_type()
             message.ParseFromString(sample.payload.to_bytes())
-            self._add_panel(worker)
+            self._come(worker)
             show(worker, message)
         except (DecodeError, ValueError) as error:
             log.warning("dropped a message at %s: %s", sample.key_expr, error)
