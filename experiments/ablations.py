@@ -1,10 +1,11 @@
-"""Ablations of CPN's losses on the development tasks, which are left out of training all at once.
+"""Ablations of losses and noise injection on the development tasks, which are left out of training all at once.
 
 Interrupted, it goes on. Each run's outcomes are kept in docs/results/ablations, of which --table makes the table.
 """
 
 import argparse
 import json
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,36 @@ SETTINGS = {"training.epochs": 3, "training.samples_per_draw": 8, "training.prec
 EVERY_UPDATE = {"training.losses.every_update": "true"}
 DYNAMICS = {"training.losses.dynamics": 0.5}
 POSITION = {"training.losses.position": 0.3}
-ARMS: dict[str, dict[str, Any]] = {
-    "paper": {},
-    "every-update": EVERY_UPDATE,
-    "every-update-dynamics": EVERY_UPDATE | DYNAMICS,
-    "every-update-dynamics-position": EVERY_UPDATE | DYNAMICS | POSITION,
+NOISY, NOISE, NOISY_EPISODES = ROOT / "data/demonstrations-noise", 0.3, 50
+"""Demonstrations with noise injection."""
+NOISY_EPOCHS = {"training.epochs": 6}
+"""As many updates of the weights as with twice the episodes and half the epochs."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Recipe of an arm."""
+
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of training beside `SETTINGS`."""
+    method: str = "cpn"
+    dataset: Path = DATASET
+
+    @property
+    def plans(self) -> bool:
+        """Whether the method plans, with a number of updates."""
+        return self.method == "cpn"
+
+
+ARMS = {
+    "paper": Arm(),
+    "every-update": Arm(EVERY_UPDATE),
+    "every-update-dynamics": Arm(EVERY_UPDATE | DYNAMICS),
+    "every-update-dynamics-position": Arm(EVERY_UPDATE | DYNAMICS | POSITION),
+    "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISY),
+    "noise-paper": Arm(NOISY_EPOCHS, dataset=NOISY),
+    "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, dataset=NOISY),
 }
-"""Settings of training beside `SETTINGS`, by arm."""
 SEEDS = (0, 1)
 UPDATES = (0, 1, 5)
 TRIALS = 20
@@ -39,11 +63,11 @@ Outcomes = dict[str, dict[str, list[int]]]
 
 def run(arm: str, seed: int) -> None:
     """Trains and evaluates an arm on one core, and keeps the outcomes."""
-    out = ROOT / f"runs/ablations/{arm}-{seed}"
-    checkpoint = out / "models/cpn.safetensors"
+    out, recipe = ROOT / f"runs/ablations/{arm}-{seed}", ARMS[arm]
+    checkpoint = out / f"models/{recipe.method}.safetensors"
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    settings = SETTINGS | ARMS[arm]
-    options = ["--preset", "paper-cpn", "--dataset", str(DATASET), "--seed", str(seed)]
+    settings = SETTINGS | recipe.settings
+    options = ["--preset", f"paper-{recipe.method}", "--dataset", str(recipe.dataset), "--seed", str(seed)]
     options += ["--hold-out", ",".join(DEVELOPMENT), "--run-dir", str(out / "run")]
     options += [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
     with Lab(out) as lab:
@@ -51,9 +75,10 @@ def run(arm: str, seed: int) -> None:
             train(lab, checkpoint, *options)
         lab.planner(checkpoint.parent)
         lab.worker("w0")
-        search = ["--models", "cpn", "--tasks", ",".join(DEVELOPMENT + TRAINED), "--trials", str(TRIALS)]
-        for updates in UPDATES:
-            lab.evaluate(*search, "--updates", str(updates), "--out", str(out / f"updates-{updates}"))
+        search = ["--models", recipe.method, "--tasks", ",".join(DEVELOPMENT + TRAINED), "--trials", str(TRIALS)]
+        for updates in UPDATES if recipe.plans else (0,):
+            choice = ["--updates", str(updates)] if recipe.plans else []
+            lab.evaluate(*search, *choice, "--out", str(out / f"updates-{updates}"))
     keep(arm, seed, out)
 
 
@@ -61,11 +86,11 @@ def keep(arm: str, seed: int, out: Path) -> None:
     """Keeps the outcomes of an arm's records."""
     successes: Outcomes = {}
     for folder in sorted(out.glob("updates-*")):
-        for path in sorted(folder.glob("trials/*/cpn/*.json")):
+        for path in sorted(folder.glob(f"trials/*/{ARMS[arm].method}/*.json")):
             trial = json.loads(path.read_text())
             by_task = successes.setdefault(folder.name.removeprefix("updates-"), {})
             by_task.setdefault(trial["task"], []).append(int(trial["outcome"] == "success"))
-    result = {"arm": arm, "seed": seed, "settings": SETTINGS | ARMS[arm], "successes": successes}
+    result = {"arm": arm, "seed": seed, "settings": SETTINGS | ARMS[arm].settings, "successes": successes}
     RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / f"{arm}-{seed}.json").write_text(json.dumps(result) + "\n")
 
@@ -96,6 +121,7 @@ def ablations() -> None:
     parser.add_argument("--table", action="store_true", help="print the table of the kept outcomes, and run nothing")
     if not parser.parse_args().table:
         record()
+        record(NOISY, NOISY_EPISODES, NOISE)
         on_every_core(lambda cell: run(*cell), product(ARMS, SEEDS))
     print(table())
 

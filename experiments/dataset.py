@@ -4,20 +4,21 @@ An interrupted run resumes.
 """
 
 import os
+from pathlib import Path
 
 from lab import PROGRAMS, ROOT, Lab, main
 
 DATASET = ROOT / "data/demonstrations"
 TASKS = 24
+EPISODES = int(os.environ.get("EPISODES") or 100)
 
 
-def record() -> None:
-    """Records as many episodes of each task as EPISODES says, 100 by default."""
-    episodes = os.environ.get("EPISODES") or "100"
+def record(dataset: Path = DATASET, episodes: int = EPISODES, noise: float = 0) -> None:
+    """Records episodes of each task, with noise injection if `noise` is above 0."""
     with Lab(ROOT / "runs/dataset") as lab:
-        lab.trainer(DATASET)
-        lab.demonstrate("--episodes", episodes)
-        verify = ["verify", "--dataset", str(DATASET), "--tasks", str(TASKS), "--episodes", episodes]
+        lab.trainer(dataset)
+        lab.demonstrate("--episodes", str(episodes), "--noise", str(noise))
+        verify = ["verify", "--dataset", str(dataset), "--tasks", str(TASKS), "--episodes", str(episodes)]
         lab.run([str(PROGRAMS / "cpn-trainer"), *verify])
 
 

@@ -62,7 +62,7 @@ def solve(simulator: Simulator, task: str, seed: int, noise: float = 0) -> Itera
     action = np.empty(0, np.float32)
     for offset in islice(_noise(task, seed, noise), MAX_EXPERT_STEPS):
         action = simulator.scene.expert(arrival.state)
-        applied = None if offset is None else np.clip(action + np.pad(offset, (0, len(action) - 3)), -1, 1)
+        applied = None if offset is None else _with_noise(action, offset)
         yield Moment(arrival, action, applied)
         arrival = simulator.step(action if applied is None else applied)
         if arrival.success:
@@ -78,10 +78,17 @@ def solve(simulator: Simulator, task: str, seed: int, noise: float = 0) -> Itera
     yield Moment(arrival, None)
 
 
-def _noise(task: str, seed: int, probability: float) -> Iterator[NDArray[np.float32] | None]:
+def _noise(task: str, seed: int, probability: float) -> Iterator[NDArray[np.float64] | None]:
     """Noise of each step, a displacement [3], or None; without end."""
     rng = np.random.default_rng([seed, *task.encode()])
     while True:
         steps = int(rng.integers(*NOISE_STEPS, endpoint=True))
-        offset = rng.uniform(-1, 1, 3).astype(np.float32)
-        yield from repeat(offset if rng.random() < probability else None, steps)
+        offset = rng.uniform(-1, 1, 3) if rng.random() < probability else None
+        yield from repeat(offset, steps)
+
+
+def _with_noise(action: NDArray[np.float32], offset: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Action with the displacement added, within its bounds."""
+    applied = action.copy()
+    applied[:3] = np.clip(action[:3] + offset, -1, 1)
+    return applied

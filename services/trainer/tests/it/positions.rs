@@ -30,6 +30,7 @@ fn reach(seed: u64, start: [f32; 3]) -> Episode {
     for step in &mut steps {
         let (now, next) = (hand(start, step.step), hand(start, step.step + 1));
         step.state = now.to_vec();
+        step.applied_action = None;
         step.action = (step.step < ACTIONS).then(|| [0, 1, 2].map(|axis| (next[axis] - now[axis]) * 100.0).to_vec());
     }
     Episode::new(RecordedEpisode { goal_position: GOAL.to_vec(), ..info("poke", seed, &steps) }, steps).unwrap()
