@@ -162,8 +162,8 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
-test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back
-	cargo build --workspace --locked --bin cpn-planner
+test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back, and the trainer
+	cargo build --workspace --locked --bin cpn-planner --bin cpn-trainer
 	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
 
 test-adapters: setup $(ADAPTERS:%=%/.venv/.ready) ## Run the policies for other frameworks in those, unmodified, against a planner

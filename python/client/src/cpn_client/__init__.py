@@ -1,6 +1,7 @@
 """Client of CPN's planner: goal image and camera image to robot actions, over zenoh or gRPC."""
 
 from cpn_client.connection import connect, connect_async
+from cpn_client.demonstration import write_episode
 from cpn_client.episode import AsyncEpisode, Episode
 from cpn_client.errors import (
     LateError,
@@ -38,4 +39,5 @@ __all__ = [
     "connect_async",
     "recorded_goal",
     "recorded_observation",
+    "write_episode",
 ]
