@@ -53,7 +53,7 @@ $(CLIENT)/.ready: python/client/pyproject.toml python/client/uv.lock $(MESSAGES)
 	cd python/client && $(UV) sync --quiet --locked --all-extras
 	touch $@
 
-$(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock $(MESSAGES) | $(UV)
+$(EXPORT)/.ready: python/export/pyproject.toml python/export/uv.lock python/client/pyproject.toml $(MESSAGES) | $(UV)
 	cd python/export && $(UV) sync --quiet --locked
 	touch $@
 
@@ -154,7 +154,7 @@ test-swap: setup ## Swap checkpoints a thousand times under a steady load of pla
 test-soak: setup ## Half an hour of everything at once against one planner: nothing fails, no memory grows
 	cargo test --workspace --locked --test it -- --ignored --nocapture soak::
 
-test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library and load them back
+test-export: $(EXPORT)/.ready ## Export recordings with lerobot's own library, load them back and import them
 	cd python/export && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
 test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client

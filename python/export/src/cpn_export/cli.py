@@ -1,4 +1,4 @@
-"""Command line of the export."""
+"""Command lines of export and import."""
 
 import sys
 import warnings
@@ -29,6 +29,24 @@ class LeRobotConfig:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
 
 
+@dataclass(frozen=True)
+class ImportConfig:
+    """Write the episodes of a LeRobotDataset v3 as recordings of a task."""
+
+    dataset: str
+    """Folder of the dataset, or its name on the Hugging Face Hub."""
+    image_key: str
+    """Camera, for example observation.images.front."""
+    task: str
+    """Name of the task."""
+    out: Path
+    """Folder of recordings."""
+    crop: bool = False
+    """Cut the longer side of images that are not square, in place of black bars at the shorter one."""
+    episodes: tuple[int, ...] = ()
+    """Indices of the episodes; all of them if none is given."""
+
+
 def lerobot() -> None:
     """Runs `cpn-export-lerobot`."""
     config = tyro.cli(LeRobotConfig, prog="cpn-export-lerobot")
@@ -43,3 +61,23 @@ def lerobot() -> None:
         sys.exit(f"cpn-export-lerobot: {error}")
     frames = sum(recording.steps - 1 for recording in recordings)
     print(f"{config.out}: {len(recordings)} episodes, {frames} frames")
+
+
+def import_lerobot() -> None:
+    """Runs `cpn-import-lerobot`."""
+    config = tyro.cli(ImportConfig, prog="cpn-import-lerobot")
+    # Imported late, as above.
+    from cpn_export.lerobot_import import import_dataset
+
+    try:
+        count = import_dataset(
+            config.dataset,
+            image_key=config.image_key,
+            task=config.task,
+            out=config.out,
+            resize="crop" if config.crop else "pad",
+            episodes=config.episodes,
+        )
+    except ExportError as error:
+        sys.exit(f"cpn-import-lerobot: {error}")
+    print(f"{config.out}: {count} recordings of {config.task}")
