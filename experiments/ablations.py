@@ -27,6 +27,7 @@ NOISY, NOISE, NOISY_EPISODES = ROOT / "data/demonstrations-noise", 0.3, 50
 """Demonstrations with noise injection."""
 NOISY_EPOCHS = {"training.epochs": 6}
 """As many updates of the weights as with twice the episodes and half the epochs."""
+AUGMENTED = {"training.goals": "hindsight", "training.shift_pixels": 4}
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,9 @@ ARMS = {
     "every-update-dynamics": Arm(EVERY_UPDATE | DYNAMICS),
     "every-update-dynamics-position": Arm(EVERY_UPDATE | DYNAMICS | POSITION),
     "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISY),
+    "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISY),
     "noise-paper": Arm(NOISY_EPOCHS, dataset=NOISY),
+    "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, dataset=NOISY),
     "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, dataset=NOISY),
 }
 SEEDS = (0, 1)

@@ -206,5 +206,5 @@ def test_memory_is_bounded(network: Network, watcher: zenoh.Session) -> None:
             return sum(process.memory_info().rss for process in processes)
 
         warm = push(2000)
-        # 5000 frames are 100 MiB.
-        assert push(5000) < warm + 40 * MIB
+        # 10,000 frames are 200 MiB. Half of that is room for what a busy machine has not yet sent.
+        assert push(10_000) < warm + 100 * MIB
