@@ -24,7 +24,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -130,6 +130,9 @@ export-lerobot: $(EXPORT)/.ready ## Turn data/demonstrations into a LeRobotDatas
 view: export CPN_CONNECT := $(or $(CPN_CONNECT),tcp/127.0.0.1:7447)
 view: $(VIEW)/.ready ## Show the simulators of a running system in the browser, and print the address (CPN_CONNECT=endpoint, CPN_NAMESPACE=prefix)
 	$(VIEW)/bin/cpn-view live
+
+import-lerobot: $(EXPORT)/.ready ## Turn a LeRobotDataset into recordings (DATASET=folder or name, IMAGE_KEY=key of the camera, TASK=name, OUT=folder)
+	$(EXPORT)/bin/cpn-import-lerobot --dataset "$(DATASET)" --image-key "$(IMAGE_KEY)" --task "$(TASK)" --out $(or $(OUT),data/own)
 
 bases: ## Make local images under the names of the public base images, where no image registry is reachable
 	deploy/bases/make.sh

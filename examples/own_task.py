@@ -5,6 +5,7 @@ examples/.venv/bin/python examples/own_task.py
 
 import argparse
 import shlex
+import socket
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,7 +22,6 @@ import cpn_client
 parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
 parser.add_argument("--folder", type=Path, default=Path("runs/own"), help="demonstrations and checkpoint")
 parser.add_argument("--programs", type=Path, default=Path("target/release"), help="folder of the programs")
-parser.add_argument("--address", default="tcp/127.0.0.1:7447", help="free address for the planner")
 parser.add_argument("--demonstrations", type=int, default=100)
 parser.add_argument("--epochs", type=int, default=60)
 parser.add_argument("--trials", type=int, default=20)
@@ -127,9 +127,12 @@ seeds = range(1_000_000, 1_000_000 + options.trials)
 env.action_space.seed(0)
 by_chance = sum(run(env.reset(seed=seed)[0], lambda _: env.action_space.sample())[2] for seed in seeds)
 planned = 0
-with subprocess.Popen(command("cpn-planner", "--models-dir", models, "--listen", options.address)) as server:
+with socket.create_server(("127.0.0.1", 0)) as free:
+    address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+listen = "--listen", address, "--grpc-listen", "127.0.0.1:0"
+with subprocess.Popen(command("cpn-planner", "--models-dir", models, *listen)) as server:
     try:
-        with cpn_client.connect(options.address) as planner:
+        with cpn_client.connect(address) as planner:
             for seed in seeds:
                 frame, info = env.reset(seed=seed)
                 with planner.episode(info["goal"], model="reach") as episode:

@@ -4,6 +4,7 @@ import fcntl
 import os
 import re
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,12 @@ def test_render_spec_is_that_of_the_frames(tmp_path: Path) -> None:
         ({"task": "o" * 63}, "task: expected a name .*, got 'ooo"),
         ({"seed": -1}, r"seed: expected 0 to 2\^64 - 1, got -1"),
         ({"seed": 2**64}, r"seed: expected 0 to 2\^64 - 1, got 18446744073709551616"),
-        ({"control_hz": 0}, "control_hz: expected above 0, at most 10000, got 0"),
-        ({"control_hz": np.nan}, "control_hz: expected above 0, at most 10000, got nan"),
+        ({"seed": 1.0}, "seed: expected an integer, got 1.0"),
+        ({"resize": "stretch"}, "resize: expected pad or crop, got 'stretch'"),
+        ({"control_hz": 1e-300}, "control_hz: expected 0.001 to 10000, got 1e-300"),
+        ({"actions": [[10**400]]}, r"actions\[0\]: expected a sequence of numbers, got \[1000"),
+        ({"control_hz": 0}, "control_hz: expected 0.001 to 10000, got 0"),
+        ({"control_hz": np.nan}, "control_hz: expected 0.001 to 10000, got nan"),
         ({"actions": []}, "actions: expected 1 to 999, got 0"),
         ({"actions": [[0]] * 1000}, "actions: expected 1 to 999, got 1000"),
         ({"actions": [[]]}, r"actions\[0\]: expected 1 to 32 values, got 0"),
@@ -107,6 +112,22 @@ def test_an_existing_recording_is_kept(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"own-3\.mcap: expected no recording of this task and seed, got one"):
         write(tmp_path, control_hz=10)
     assert (tmp_path / "own/own-3.mcap").read_bytes() == before
+
+
+def test_one_of_two_writers_of_an_episode_writes_it(tmp_path: Path) -> None:
+    def attempt(frames: Any) -> bool:  # noqa: ANN401
+        try:
+            write(tmp_path, frames=frames, actions=[[0.0]] * 400)
+        except FileExistsError:
+            return False
+        return True
+
+    noise = RANDOM.integers(0, 256, (2, 401, 84, 84, 3), np.uint8)
+    with ThreadPoolExecutor() as pool:
+        written = list(pool.map(attempt, noise))
+    assert sorted(written) == [False, True]
+    (path,) = tmp_path.glob("own/*")
+    assert recorded_goal(path) == Image.of(noise[written.index(True), -1])
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

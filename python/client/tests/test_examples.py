@@ -31,7 +31,7 @@ def test_task_is_solved_in_closed_loop(process: PlannerProcess, example: str) ->
 
 def test_own_task_is_demonstrated_trained_and_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CPN_PLANNER_GRPC_LISTEN", f"127.0.0.1:{free_port()}")
-    options = ["--folder", str(tmp_path), "--programs", str(PROGRAMS), "--address", f"tcp/127.0.0.1:{free_port()}"]
+    options = ["--folder", str(tmp_path), "--programs", str(PROGRAMS)]
     small = ["--demonstrations", "8", "--epochs", "2", "--trials", "2"]
     printed = output(UV, "run", "--quiet", "--project", "examples", "examples/own_task.py", *options, *small)
     assert "8 episodes, dataset digest" in printed

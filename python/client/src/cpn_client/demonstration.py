@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
+import operator
 import os
 import re
 import struct
+import tempfile
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +22,7 @@ MAX_STEPS = 1000
 MAX_ACTION = 32
 """Largest size of an action that a model has."""
 MAX_STATE = 1024
-MAX_CONTROL_HZ = 10_000
+MIN_CONTROL_HZ, MAX_CONTROL_HZ = 0.001, 10_000
 CHUNK_BYTES = 4 << 20
 """Chunk size of a file: most episodes in one, since a frame compresses only against earlier ones of its chunk."""
 
@@ -46,9 +48,9 @@ def write_episode(
         frames: Camera images, T + 1, with T from 1 to 999: one before each action, and the goal image, that of the
             finished task.
         actions: [T, A] in [-1, 1], with A from 1 to 32, the same in all episodes of a dataset.
-        control_hz: Actions per second, above 0 and at most 10000.
+        control_hz: Actions per second, 0.001 to 10000, the same in all episodes of a dataset.
         states: [T + 1, S], with S up to 1024 and the hand's x, y, z in metres first; no policy sees them.
-        success: Whether the task is solved at the last frame.
+        success: Whether the task is solved at the last frame; `cpn-trainer verify` reports an episode that is not.
         resize: Treatment of images that are not square, see `Image.of`; images of plans need the same.
 
     Returns:
@@ -66,10 +68,14 @@ def write_episode(
     # Without a dot at the start: such files are passed over.
     if not re.fullmatch(r"[a-z0-9_-][a-z0-9._-]*", task) or len(episode_id) > 64:
         raise invalid("task", "a name of a-z, 0-9, '.', '_' and '-', with the seed at most 64 characters", repr(task))
+    try:
+        seed = operator.index(seed)
+    except TypeError:
+        raise invalid("seed", "an integer", repr(seed)) from None
     if not 0 <= seed < 2**64:
         raise invalid("seed", "0 to 2^64 - 1", seed)
-    if not 0 < control_hz <= MAX_CONTROL_HZ:
-        raise invalid("control_hz", f"above 0, at most {MAX_CONTROL_HZ}", control_hz)
+    if not MIN_CONTROL_HZ <= control_hz <= MAX_CONTROL_HZ:
+        raise invalid("control_hz", f"{MIN_CONTROL_HZ} to {MAX_CONTROL_HZ}", control_hz)
     steps = _steps(actions, states, success)
     images = _images(frames, len(steps), resize)
     header = demonstration_pb2.RecordedEpisode(
@@ -112,8 +118,8 @@ def _steps(
 def _floats(values: Iterable[float], field: str) -> list[float]:
     try:
         return [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise invalid(field, "a sequence of numbers", values) from None
+    except (OverflowError, TypeError, ValueError):
+        raise invalid(field, "a sequence of numbers", repr(values)) from None
 
 
 def _check_action(first: Sequence[float], action: Sequence[float], field: str) -> None:
@@ -174,18 +180,20 @@ def _beside_writers(folder: Path) -> Generator[None]:
 @contextmanager
 def _appearing(path: Path) -> Generator[IO[bytes]]:
     """File under a temporary name, which gets its own once it is written."""
+    taken = FileExistsError(f"{path}: expected no recording of this task and seed, got one")
     if path.exists():
-        raise FileExistsError(f"{path}: expected no recording of this task and seed, got one")
-    # The trainer passes over this name, and removes what killed processes leave of it.
-    unfinished = path.with_name(f".unfinished-{path.name}")
-    try:
-        with unfinished.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.rename(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+        raise taken
+    # The trainer passes over names that begin so, and removes what killed processes leave of them.
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".unfinished-", suffix=path.suffix) as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+        os.chmod(file.name, 0o644)
+        try:
+            # A link, unlike a rename, fails if another process has written the recording meanwhile.
+            os.link(file.name, path)
+        except FileExistsError:
+            raise taken from None
 
 
 def _write(

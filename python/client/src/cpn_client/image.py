@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, cast, get_args
 
 from cpn.v1 import types_pb2
 from cpn_client.errors import invalid
@@ -62,10 +62,12 @@ class Image:
             field: Name of the image in errors.
 
         Raises:
-            ValueError: If the array has another type or shape.
+            ValueError: If the array has another type or shape, or `resize` is another word.
             ImportError: If the image is a file or has to be scaled, and Pillow is not installed.
             OSError: If the file cannot be read, or is no image.
         """
+        if resize not in get_args(Resize):
+            raise invalid("resize", " or ".join(get_args(Resize)), repr(resize))
         if isinstance(source, Image):
             return source
         if isinstance(source, (bytes, bytearray)):

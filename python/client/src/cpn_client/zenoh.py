@@ -44,7 +44,7 @@ def _config(address: Address) -> zenoh.Config:
     config = zenoh.Config()
     settings = {
         "mode": "client",
-        "connect/endpoints": [address.endpoint],
+        "connect/endpoints": address.endpoint.split(","),
         # Of a session that has lost its connection; the first one has a single attempt.
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,

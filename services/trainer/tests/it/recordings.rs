@@ -126,7 +126,8 @@ fn verify_reports_the_contents_of_a_dataset() {
     dataset(folder.path());
     let report = verify::run(folder.path(), 1, 1).unwrap();
     assert_eq!(report.faults, Vec::<String>::new());
-    let rows: Vec<_> = report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.rejected, t.steps_mean)).collect();
+    let rows: Vec<_> =
+        report.tasks.iter().map(|t| (t.task.as_str(), t.episodes, t.skipped_seeds, t.steps_mean)).collect();
     assert_eq!(rows, [("push", 1, 0, 4.0), ("reach", 2, 1, 4.0)]);
     assert_eq!(report.digest, Dataset::load(folder.path(), &[], Input::Image).unwrap().digest());
     let text = report.to_string();

@@ -5,6 +5,7 @@ planner that no longer knows the goal can get it again. A goal is forgotten by d
 """
 
 import re
+import sys
 from pathlib import Path
 
 import PIL.Image
@@ -42,12 +43,14 @@ def keep(name: str, goal: Goal) -> None:
 
 
 def kept() -> dict[str, Goal]:
-    """Goals by name, in alphabetical order.
-
-    Raises:
-        ValueError: If a file in the folder is no goal.
-    """
-    return {file.stem: _read(file) for file in sorted(_folder().glob("*.png"))}
+    """Goals by name, in alphabetical order; a file that is no goal is left out, with a warning."""
+    goals: dict[str, Goal] = {}
+    for file in sorted(_folder().glob("*.png")):
+        try:
+            goals[file.stem] = _read(file)
+        except ValueError as error:
+            print(f"cpn: {error}; left out", file=sys.stderr)
+    return goals
 
 
 def find(name_or_id: str) -> Goal | None:
@@ -72,5 +75,7 @@ def _read(file: Path) -> Goal:
     try:
         image = PIL.Image.open(file)
         return Goal(image.info["id"], Image(image.tobytes(), image.info["render_spec"]))
-    except (OSError, SyntaxError, KeyError, ValueError) as error:
+    except KeyError as error:
+        raise invalid(str(file), "a registered goal", f"an image without the text {error}") from None
+    except (OSError, SyntaxError, ValueError) as error:
         raise invalid(str(file), "a registered goal", error) from None
