@@ -110,7 +110,7 @@ def batches(path: Path, entity: str) -> Iterator[pa.RecordBatch]:
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
-    """What was logged to an entity, in order: the components of each row, by name."""
+    """Components of each row of an entity, by name, in the order of logging."""
     found: list[dict[str, Any]] = []
     for batch in batches(path, entity):
         components = [name for name in batch.schema.names if ":" in name]
