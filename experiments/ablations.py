@@ -37,7 +37,13 @@ class Arm:
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of training beside `SETTINGS`."""
     method: str = "cpn"
-    dataset: Path = DATASET
+    noise: float = 0
+    """Noise injection of the demonstrations."""
+
+    @property
+    def dataset(self) -> Path:
+        """Folder of the demonstrations."""
+        return NOISY if self.noise else DATASET
 
     @property
     def plans(self) -> bool:
@@ -50,11 +56,11 @@ ARMS = {
     "every-update": Arm(EVERY_UPDATE),
     "every-update-dynamics": Arm(EVERY_UPDATE | DYNAMICS),
     "every-update-dynamics-position": Arm(EVERY_UPDATE | DYNAMICS | POSITION),
-    "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISY),
-    "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISY),
-    "noise-paper": Arm(NOISY_EPOCHS, dataset=NOISY),
-    "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, dataset=NOISY),
-    "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, dataset=NOISY),
+    "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISE),
+    "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISE),
+    "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
+    "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, noise=NOISE),
+    "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, noise=NOISE),
 }
 SEEDS = (0, 1)
 UPDATES = (0, 1, 5)
@@ -93,7 +99,9 @@ def keep(arm: str, seed: int, out: Path) -> None:
             trial = json.loads(path.read_text())
             by_task = successes.setdefault(folder.name.removeprefix("updates-"), {})
             by_task.setdefault(trial["task"], []).append(int(trial["outcome"] == "success"))
-    result = {"arm": arm, "seed": seed, "settings": SETTINGS | ARMS[arm].settings, "successes": successes}
+    recipe = ARMS[arm]
+    result = {"arm": arm, "seed": seed, "method": recipe.method, "noise": recipe.noise}
+    result |= {"settings": SETTINGS | recipe.settings, "successes": successes}
     RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / f"{arm}-{seed}.json").write_text(json.dumps(result) + "\n")
 
