@@ -223,10 +223,12 @@ def test_watchers_see_every_applied_step(worker: Worker) -> None:
     actions = worker.session.declare_subscriber(keys.sim_action("w0"), collect())
     start = worker.reset()
     steps = [worker.step(start.episode_id, step, (0, 0, 1, 0)) for step in (0, 0, 1)]
-    images = [start.observation, steps[0].observation, steps[2].observation]
-    for step, image in enumerate(images):
+    for step, state in enumerate([start, steps[0], steps[2]]):
         frame = decode(sim_pb2.Frame, wait_for_sample(frames, zenoh.SampleKind.PUT).payload.to_bytes())
-        assert frame == sim_pb2.Frame(episode_id=start.episode_id, step=step, image=image)
+        assert (frame.episode_id, frame.step) == (start.episode_id, step)
+        assert (frame.image, frame.goal) == (state.observation, start.goal)
+        assert (frame.success, frame.progress) == (state.success, state.progress)
+        assert (frame.hand_position, frame.control) == (state.hand_position, start.control)
     for step in range(2):
         action = decode(sim_pb2.AppliedAction, wait_for_sample(actions, zenoh.SampleKind.PUT).payload.to_bytes())
         assert (action.episode_id, action.step, list(action.action.values)) == (start.episode_id, step, [0, 0, 1, 0])
@@ -268,7 +270,7 @@ def test_sigterm_ends_a_worker_and_its_token(session: zenoh.Session, start_worke
 def test_fault_in_a_request_is_answered_and_ends_the_episode(session: zenoh.Session, simulator: Simulator) -> None:
     # An episode without a loaded task.
     episodes = EpisodeRunner(Simulator(simulator._renderer), max_steps=1)
-    episodes._episode = _Episode("x")
+    episodes._episode = _Episode("x", goal=types_pb2.Image(), observation=types_pb2.Image(), hand_position=[])
     server = SimServer(session, "faulty", episodes)
     alive = session.liveliness().declare_subscriber(keys.sim_alive("faulty"), collect())
     stop = threading.Event()

@@ -7,7 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from cpn_sim_worker.render import Renderer
+from cpn_sim_worker.scene import CameraPose, camera_pose
 from cpn_sim_worker.simulator import Simulator
+from cpn_sim_worker.spaces import IMAGE_SIZE
 from cpn_sim_worker.tasks import TASKS, UnknownTaskError
 
 # Prints one digest per frame of a short walk through the tasks named on its command line.
@@ -124,3 +126,35 @@ def test_goal_site_is_hidden(simulator: Simulator, task: str) -> None:
     scene.model.site("goal").pos[2] += 0.1
     mujoco.mj_forward(scene.model, scene.data)  # pyright: ignore[reportAttributeAccessIssue]
     assert np.array_equal(simulator.frame(), hidden)
+
+
+# Along the third axis, Jenga's hand passes before its tower.
+@pytest.mark.parametrize(
+    ("task", "axis"), [("reach", 0), ("reach", 1), ("reach", 2), ("jenga-poke", 0), ("jenga-poke", 1)]
+)
+def test_camera_pose_follows_the_hand(simulator: Simulator, task: str, axis: int) -> None:
+    state = simulator.reset(task, 0)
+    before = pixel(camera_pose(simulator.scene), state[:3])
+    frame_before = simulator.frame().astype(int)
+    action = np.zeros(simulator.scene.action_size, np.float32)
+    action[axis] = -1
+    *_, arrival = (simulator.step(action) for _ in range(6))
+    after = pixel(camera_pose(simulator.scene), arrival.state[:3])
+    frame_after = simulator.frame().astype(int)
+
+    hand = patch(frame_before, before)
+    moved = np.abs(patch(frame_after, after) - hand).mean()
+    assert moved < np.abs(patch(frame_after, before) - hand).mean()
+    assert moved < np.abs(patch(frame_after, 2 * before - after) - hand).mean()
+
+
+def pixel(pose: CameraPose, position: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Row and column of a position, by a pinhole camera."""
+    right, up, away = pose.rotation.T @ (position - pose.position)
+    focal = IMAGE_SIZE / 2 / np.tan(np.radians(pose.field_of_view_degrees) / 2)
+    return np.round(IMAGE_SIZE / 2 + focal * np.array([-up, right]) / -away).astype(int)
+
+
+def patch(frame: NDArray[np.int64], centre: NDArray[np.int64]) -> NDArray[np.int64]:
+    row, column = centre
+    return frame[row - 5 : row + 6, column - 5 : column + 6]

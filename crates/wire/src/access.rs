@@ -137,6 +137,7 @@ pub const ENDPOINTS: &[Endpoint] = &[
     zenoh(Kind::Query, || key::sim_step("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Publication, || key::sim_frame("*"), &[Worker], &[Viewer]),
     zenoh(Kind::Publication, || key::sim_action("*"), &[Worker], &[Viewer]),
+    zenoh(Kind::Publication, || key::sim_plan("*"), &[Evaluator], &[Viewer]),
     // A trainer may send its recordings to another one, as a worker does.
     zenoh(Kind::Publication, || key::demonstration_step("*", "*"), &[Worker, Trainer], &[Trainer]),
     zenoh(Kind::Query, || key::demonstration_step("*", "*"), &[Trainer], &[Trainer, Viewer]),

@@ -63,9 +63,20 @@ class Network:
     def alive(self, worker: str) -> zenoh.LivelinessToken:
         return self.session.liveliness().declare_token(f"cpn/@v1/alive/sim/{worker}")
 
-    def frame(self, worker: str, step: int, frame: NDArray[np.uint8], episode: str = "reach-0-ab") -> None:
-        message = sim_pb2.Frame(episode_id=episode, step=step, image=image(frame))
+    def frame(
+        self,
+        worker: str,
+        step: int,
+        frame: NDArray[np.uint8],
+        episode: str = "reach-0-ab",
+        **fields: Any,  # noqa: ANN401
+    ) -> None:
+        message = sim_pb2.Frame(episode_id=episode, step=step, image=image(frame), **fields)
         self.session.put(f"cpn/@v1/sim/{worker}/frame", message.SerializeToString())
+
+    def plan(self, worker: str, step: int, plan: planner_pb2.PlanResponse, episode: str = "reach-0-ab") -> None:
+        message = trial_pb2.TrialPlan(episode_id=episode, step=step, model="cpn", plan=plan)
+        self.session.put(f"cpn/@v1/sim/{worker}/plan", message.SerializeToString())
 
     def action(self, worker: str, step: int, values: NDArray[np.float32], episode: str = "reach-0-ab") -> None:
         message = sim_pb2.AppliedAction(episode_id=episode, step=step, action=action(values))

@@ -13,8 +13,8 @@ import rerun as rr
 import zenoh
 from google.protobuf.message import Message
 
-from cpn.v1 import sim_pb2, types_pb2
-from cpn_view.live import ACTIONS, ALIVE, FRAMES, QUEUE_LENGTH, LiveView
+from cpn.v1 import planner_pb2, sim_pb2, types_pb2
+from cpn_view.live import ACTIONS, ALIVE, FRAMES, PLANS, QUEUE_LENGTH, LiveView
 from cpn_view.viewer import ViewerConfig, serve
 from tests.support import (
     WAIT_SECONDS,
@@ -22,8 +22,10 @@ from tests.support import (
     action,
     actions,
     blueprints,
+    column,
     frames,
     free_port,
+    image,
     pictures,
     rows,
     scalars,
@@ -79,7 +81,7 @@ def frame_of(**image: Any) -> sim_pb2.Frame:  # noqa: ANN401
 
 def test_keys() -> None:
     golden = json.loads((ROOT / "tests/golden/keys.json").read_text())
-    for name, key in {"sim_frame": FRAMES, "sim_action": ACTIONS, "sim_alive": ALIVE}.items():
+    for name, key in {"sim_frame": FRAMES, "sim_action": ACTIONS, "sim_plan": PLANS, "sim_alive": ALIVE}.items():
         assert golden[name]["key"] == key.replace("*", "w0")
 
 
@@ -94,7 +96,9 @@ def test_two_workers(network: Network, shown: Shown, rrd: Path) -> None:
     for worker, seed in (("w0", 0), ("w1", 1)):
         np.testing.assert_array_equal(pictures(rrd, f"/workers/{worker}/camera"), frames(4, seed))
         np.testing.assert_array_equal(scalars(rrd, f"/workers/{worker}/action"), values[:3])
-        assert texts(rrd, f"/workers/{worker}/episode") == [f"reach-0-ab, step {step}" for step in range(4)]
+        assert [text.splitlines()[0] for text in texts(rrd, f"/workers/{worker}/episode")] == [
+            f"reach-0-ab, step {step}" for step in range(4)
+        ]
     assert blueprints(rrd) <= 3, "a blueprint without workers, and one for each that came"
 
 
@@ -113,6 +117,65 @@ def test_gap_between_episodes(network: Network, shown: Shown, rrd: Path) -> None
     ]
 
 
+def test_goals_and_solved_episodes(network: Network, shown: Shown, rrd: Path) -> None:
+    goals = frames(2, 7)
+    for number, episode in enumerate(("a", "b")):
+        for step in range(3):
+            fields = {"goal": image(goals[number]), "success": episode == "a" and step == 2, "progress": step / 4}
+            network.frame("w0", step, frames(1)[0], episode, **fields)
+            shown(lambda: len(texts(rrd, "/workers/w0/episode")) == 3 * number + step + 1)  # noqa: B023
+    np.testing.assert_array_equal(pictures(rrd, "/workers/w0/goal"), goals)
+    np.testing.assert_allclose(scalars(rrd, "/workers/w0/progress")[:, 0], [0, 0.25, 0.5] * 2)
+    assert texts(rrd, "/workers/w0/episode")[1::2] == [
+        "a, step 1\nprogress 0.25\n0 of 1 episodes solved so far",
+        "b, step 0\nprogress 0.00\n1 of 2 episodes solved so far",
+        "b, step 2\nprogress 0.50\n1 of 2 episodes solved so far",
+    ]
+    assert texts(rrd, "/workers/w0/episode")[2] == "a, step 2\nsolved\n1 of 1 episodes solved so far"
+
+
+def test_plans(network: Network, shown: Shown, rrd: Path) -> None:
+    camera = {"position": [0, 0, 1], "rotation": np.eye(3).ravel().tolist(), "field_of_view_degrees": 60}
+    control = {"action_size": 4, "metres": 0.5, "hz": 10}
+    network.frame("w0", 0, frames(1)[0], control=control, camera=camera, hand_position=[0.25, 0, 0])
+    shown(lambda: pictures(rrd, "/workers/w0/camera"))
+
+    planned = planner_pb2.PlanResponse(
+        actions=[action(np.array(values, np.float32)) for values in ([1, 0, 0, 1], [2, -0.5, 0, 1])],
+        inner_losses=[3, 2, 1],
+        latent_distance=0.5,
+        times={"queue_seconds": 0.001, "encode_seconds": 0.002, "plan_seconds": 0.003},
+    )
+    # Of another episode than the frame: without a path.
+    network.plan("w0", 9, planned, "reach-1-cd")
+    network.plan("w0", 0, planned)
+    shown(lambda: len(scalars(rrd, "/workers/w0/plan/times_ms")) == 2)
+    np.testing.assert_allclose(scalars(rrd, "/workers/w0/plan/times_ms")[0], [1, 2, 3])
+    np.testing.assert_allclose(scalars(rrd, "/workers/w0/plan/latent_distance")[0], [0.5])
+    np.testing.assert_allclose(scalars(rrd, "/workers/w0/plan/inner_loss")[0], [3, 1])
+    ((strip,),) = column(rrd, "/workers/w0/path", "LineStrips3D:strips")
+    np.testing.assert_allclose(np.reshape(strip, (3, 3)), [[0.25, 0, 0], [0.75, 0, 0], [1.25, -0.25, 0]])
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"camera": {"position": [0, 0], "rotation": [1] * 9, "field_of_view_degrees": 60}},
+        {"camera": {"position": [0, 0, 0], "rotation": [1] * 8, "field_of_view_degrees": 60}},
+        {"camera": {"position": [0, 0, 0], "rotation": [1] * 9, "field_of_view_degrees": 0}},
+        {"camera": {"position": [0, 0, 0], "rotation": [1] * 9, "field_of_view_degrees": 60}, "hand_position": [0, 0]},
+        {"goal": types_pb2.Image(height=2, width=2)},
+    ],
+)
+def test_faulty_frame_is_dropped(
+    network: Network, shown: Shown, rrd: Path, caplog: pytest.LogCaptureFixture, fields: dict[str, Any]
+) -> None:
+    network.frame("w0", 0, frames(1)[0], **fields)
+    shown(lambda: "dropped a message at cpn/@v1/sim/w0/frame: " in caplog.text)
+    network.frame("w0", 1, frames(1)[0])
+    shown(lambda: len(pictures(rrd, "/workers/w0/camera")) == 1)
+
+
 def test_slow_view_shows_the_present(network: Network, watcher: zenoh.Session, shown: Shown, rrd: Path) -> None:
     last = 10 * QUEUE_LENGTH
     with watcher.declare_subscriber("cpn/@v1/sim/w0/frame") as arrivals:
@@ -121,7 +184,8 @@ def test_slow_view_shows_the_present(network: Network, watcher: zenoh.Session, s
             network.frame("w0", step, frames(1)[0])
             arrivals.recv()
     shown(lambda: texts(rrd, "/workers/w0/episode"))
-    assert texts(rrd, "/workers/w0/episode") == [f"reach-0-ab, step {last}"]
+    (text,) = texts(rrd, "/workers/w0/episode")
+    assert text.startswith(f"reach-0-ab, step {last}\n")
     np.testing.assert_array_equal(scalars(rrd, "/workers/w0/action")[:, 0], range(last - QUEUE_LENGTH + 1, last + 1))
 
 
@@ -174,7 +238,10 @@ def test_simulator_worker(network: Network, shown: Shown, rrd: Path) -> None:
             process.terminate()
     assert [picture.tobytes() for picture in pictures(rrd, "/workers/real/camera")] == images
     np.testing.assert_array_equal(scalars(rrd, "/workers/real/action"), actions(5, 4))
-    assert texts(rrd, "/workers/real/episode")[-1] == f"{reset.episode_id}, step 5"
+    assert texts(rrd, "/workers/real/episode")[-1].startswith(f"{reset.episode_id}, step 5\n")
+    assert [picture.tobytes() for picture in pictures(rrd, "/workers/real/goal")] == [reset.goal.data]
+    ((resolution,),) = column(rrd, "/workers/real/camera", "Pinhole:resolution")
+    assert list(resolution) == [84, 84]
 
 
 def ask(network: Network, method: str, request: Message, response_type: type[M]) -> M:

@@ -59,6 +59,14 @@ impl<'a> Actor<'a> {
         }
     }
 
+    /// The latest plan request with its answer; none of a control.
+    pub(crate) fn latest(&self) -> Option<&Exchange> {
+        match self {
+            Self::Control(_) => None,
+            Self::Planned(planner) => planner.exchanges.last(),
+        }
+    }
+
     /// Plan requests with their answers; none of a control.
     pub(crate) fn exchanges(self) -> Vec<Exchange> {
         match self {

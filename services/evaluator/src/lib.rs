@@ -28,6 +28,7 @@ mod schedule;
 mod summary;
 mod table;
 mod trial;
+mod watchers;
 
 pub use cli::{Cli, Command, CompareArgs, ReplayArgs, ReportArgs, RunArgs};
 pub use compare::{Comparison, Source, Sources, TaskComparison, compare};

@@ -5,6 +5,7 @@ use crate::control::Control;
 use crate::link::Link;
 use crate::presence::Service;
 use crate::record::{self, GoalSource, Model, Outcome, Run, StageTimes};
+use crate::watchers::Watchers;
 use anyhow::bail;
 use recording::trial::{Exchange, Frame, Recording};
 use service_kit::network::is_outage;
@@ -143,6 +144,7 @@ pub(crate) async fn attempt(
     let mut actor = Actor::new(link, planner, model, &run.planning, variation.seed, &reset, start).await?;
 
     let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
+    let watchers = Watchers::new(link, worker.name(), &reset.episode_id, &model.name).await.map_err(by_worker)?;
     let mut hand = reset.hand_position;
     let mut frames = vec![Frame { image: reset.observation.clone(), time: Duration::ZERO }];
     let mut progress = vec![reset.progress];
@@ -150,6 +152,9 @@ pub(crate) async fn attempt(
     let mut held = vec![0.0; reset.control.action_size as usize];
     while step < reset.max_steps {
         let mut decided = actor.decide(&reset, step, &frames[frames.len() - 1].image, hand).await?;
+        if let Some(exchange) = actor.latest() {
+            watchers.show(exchange).await;
+        }
         if run.planning.real_time {
             let steps = (decided.thinking_seconds * reset.control.hz).ceil().max(1.0) as usize;
             let next = decided.actions.swap_remove(0);
@@ -242,6 +247,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
     use tokio::sync::watch;
     use wire::planner::{PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
+    use wire::trial::TrialPlan;
     use wire::{Image, Position, query, sim};
     use zenoh::Session;
     use zenoh::key_expr::OwnedKeyExpr;
@@ -388,6 +394,22 @@ mod tests {
         assert_eq!(episode.first_inner_losses, [None, Some(seeds[0])]);
         assert_eq!(episode.last_inner_losses, [None, Some(seeds[1])]);
         assert_eq!(episode.mean_times.plan_seconds, 0.5);
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn plans_are_published_for_watchers() {
+        let (link, _) = forgetful().await;
+        let watcher = link.session.declare_subscriber(key::sim_plan("*").unwrap()).await.unwrap();
+        let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &default_run()).await.unwrap();
+        for Exchange { step, response, .. } in attempt.recording.exchanges() {
+            let sample = watcher.try_recv().unwrap().unwrap();
+            assert_eq!(sample.key_expr().as_str(), key::sim_plan("w").unwrap().as_str());
+            let TrialPlan { episode_id, step: published, model, plan } =
+                wire::decode(&sample.payload().to_bytes()).unwrap();
+            assert_eq!((episode_id.as_str(), published, model.as_str()), ("e", *step, "cpn"));
+            assert_eq!(wire::encode(plan), wire::encode(response.clone()), "NaN equals itself");
+        }
+        assert!(watcher.try_recv().unwrap().is_none());
     }
 
     #[tokio::test(flavor = "multi_thread")]

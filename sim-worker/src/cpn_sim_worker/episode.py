@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cpn.v1 import sim_pb2, types_pb2
 from cpn_sim_worker.expert import ExpertFailedError, solve
+from cpn_sim_worker.scene import camera_pose
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.tasks import MissingExtraError, SeedError, UnknownTaskError
 from cpn_sim_worker.wire import RequestError, action_from_proto, image_to_proto, invalid
@@ -24,6 +25,9 @@ class _Applied:
 @dataclass
 class _Episode:
     id: str
+    goal: types_pb2.Image
+    observation: types_pb2.Image
+    hand_position: list[float]
     steps: int = 0
     success: bool = False
     done: bool = False
@@ -57,18 +61,24 @@ class EpisodeRunner:
         goal, goal_position = self._frame(), self._simulator.scene.goal_position.tolist()
 
         state, scene = self._simulator.reset(task, seed), self._simulator.scene
-        self._episode = _Episode(id=f"{task}-{seed}-{uuid4().hex[:12]}")
-        return sim_pb2.ResetResponse(
-            episode_id=self._episode.id,
+        episode = _Episode(
+            id=f"{task}-{seed}-{uuid4().hex[:12]}",
             goal=goal,
             observation=self._frame(),
+            hand_position=_hand_position(state),
+        )
+        self._episode = episode
+        return sim_pb2.ResetResponse(
+            episode_id=episode.id,
+            goal=goal,
+            observation=episode.observation,
             max_steps=self._max_steps,
             goal_position=goal_position,
-            hand_position=_hand_position(state),
+            hand_position=episode.hand_position,
             goal_hand_position=_hand_position(end),
             success=scene.solved,
             progress=scene.progress,
-            control=sim_pb2.Control(action_size=scene.action_size, metres=scene.action_metres, hz=scene.control_hz),
+            control=self._control(),
         )
 
     def step(self, request: sim_pb2.StepRequest) -> tuple[sim_pb2.StepResponse, bool]:
@@ -96,16 +106,39 @@ class EpisodeRunner:
         episode.steps += 1
         episode.success |= transition.success
         episode.done = episode.success or episode.steps >= self._max_steps
+        episode.observation, episode.hand_position = self._frame(), _hand_position(transition.state)
         response = sim_pb2.StepResponse(
-            observation=self._frame(),
+            observation=episode.observation,
             reward=transition.reward,
             success=episode.success,
             done=episode.done,
-            hand_position=_hand_position(transition.state),
+            hand_position=episode.hand_position,
             progress=self._simulator.scene.progress,
         )
         episode.latest = _Applied(action, response)
         return response, True
+
+    def frame(self) -> sim_pb2.Frame | None:
+        """Latest frame of the running episode, for watchers; None without an episode."""
+        episode, scene = self._episode, self._simulator.scene
+        if episode is None:
+            return None
+        camera = camera_pose(scene)
+        return sim_pb2.Frame(
+            episode_id=episode.id,
+            step=episode.steps,
+            image=episode.observation,
+            goal=episode.goal,
+            success=episode.success or scene.solved,
+            progress=scene.progress,
+            hand_position=episode.hand_position,
+            control=self._control(),
+            camera=sim_pb2.CameraPose(
+                position=camera.position.tolist(),
+                rotation=camera.rotation.ravel().tolist(),
+                field_of_view_degrees=camera.field_of_view_degrees,
+            ),
+        )
 
     def abandon(self) -> None:
         """Ends the running episode, if any; its further steps are refused."""
@@ -125,6 +158,10 @@ class EpisodeRunner:
             expected = "a seed whose variation the scripted expert solves"
             raise RequestError(code, field, expected, error.seed) from None
         return end.arrival.state
+
+    def _control(self) -> sim_pb2.Control:
+        scene = self._simulator.scene
+        return sim_pb2.Control(action_size=scene.action_size, metres=scene.action_metres, hz=scene.control_hz)
 
     def _frame(self) -> types_pb2.Image:
         return image_to_proto(self._simulator.frame(), str(self._simulator.render_spec))

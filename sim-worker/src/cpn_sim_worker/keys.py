@@ -27,6 +27,11 @@ def sim_action(worker: str) -> str:
     return f"{ROOT}/sim/{worker}/action"
 
 
+def sim_plan(worker: str) -> str:
+    """Put: `TrialPlan`, by the evaluator."""
+    return f"{ROOT}/sim/{worker}/plan"
+
+
 def sim_alive(worker: str) -> str:
     """Liveliness token of a worker that is ready."""
     return f"{ROOT}/alive/sim/{worker}"

@@ -31,6 +31,18 @@ class Camera:
     """Axis to reverse in GL's images, whose rows start at the bottom: the columns for a camera mounted upside down."""
 
 
+@dataclass(frozen=True)
+class CameraPose:
+    """Pose of a camera, with which positions are drawn into its images."""
+
+    position: NDArray[np.float64]
+    """[3], in metres."""
+    rotation: NDArray[np.float64]
+    """[3, 3]; its columns are the image's right, its up, and the direction away from the scene."""
+    field_of_view_degrees: float
+    """Vertical field of view, in degrees."""
+
+
 class Scene(Protocol):
     """Physics and scripted expert of a task, with variations that depend on the seed alone."""
 
@@ -104,3 +116,12 @@ class Scene(Protocol):
     def expert(self, state: NDArray[np.float64]) -> NDArray[np.float32]:
         """Next action of the scripted expert in a state, [A] in [-1, 1]."""
         ...
+
+
+def camera_pose(scene: Scene) -> CameraPose:
+    """Pose of a scene's camera in the present state."""
+    camera = scene.data.camera(scene.camera.name)
+    # A camera mounted upside down, whose images are turned by half a turn.
+    turn = np.diag([-1.0, -1.0, 1.0]) if scene.camera.flip == "columns" else np.eye(3)
+    field_of_view = float(scene.model.camera(scene.camera.name).fovy[0])
+    return CameraPose(camera.xpos.copy(), camera.xmat.reshape(3, 3) @ turn, field_of_view)

@@ -161,7 +161,7 @@ class SimServer:
     def _reset(self, query: zenoh.Query) -> None:
         response = self._episodes.reset(_request(query, sim_pb2.ResetRequest))
         _reply(query, keys.sim_reset(self._worker), response)
-        self._publish_frame(response.episode_id, 0, response.observation)
+        self._publish_frame()
 
     def _step(self, query: zenoh.Query) -> None:
         request = _request(query, sim_pb2.StepRequest)
@@ -170,10 +170,11 @@ class SimServer:
         if applied:
             action = sim_pb2.AppliedAction(episode_id=request.episode_id, step=request.step, action=request.action)
             self._actions.put(action.SerializeToString())
-            self._publish_frame(request.episode_id, request.step + 1, response.observation)
+            self._publish_frame()
 
-    def _publish_frame(self, episode_id: str, step: int, image: types_pb2.Image) -> None:
-        self._frames.put(sim_pb2.Frame(episode_id=episode_id, step=step, image=image).SerializeToString())
+    def _publish_frame(self) -> None:
+        if frame := self._episodes.frame():
+            self._frames.put(frame.SerializeToString())
 
 
 def _request(query: zenoh.Query, message_type: type[M]) -> M:

@@ -15,6 +15,7 @@ fn keys_match_the_golden_ones() {
             "sim_step" => key::sim_step(&chunk("worker")),
             "sim_frame" => key::sim_frame(&chunk("worker")),
             "sim_action" => key::sim_action(&chunk("worker")),
+            "sim_plan" => key::sim_plan(&chunk("worker")),
             "sim_alive" => key::sim_alive(&chunk("worker")),
             "demonstration_step" => key::demonstration_step(&chunk("episode"), &chunk("step")),
             "demonstration_commit" => key::demonstration_commit(&chunk("episode")),

@@ -160,9 +160,10 @@ proptest! {
         goal_id in digest(),
         (iterations, iterations_run) in any::<(u32, u32)>(),
         warm_start in vec(action(), 0..6),
+        (episode_id, model) in (".{0,20}", name()),
     ) {
         let times = StageTimes { queue_seconds, encode_seconds, plan_seconds };
-        survives(PlanResponse {
+        let plan = PlanResponse {
             actions,
             first_action,
             inner_losses,
@@ -173,7 +174,9 @@ proptest! {
             iterations,
             iterations_run,
             warm_start,
-        });
+        };
+        survives(plan.clone());
+        survives(TrialPlan { episode_id, step: iterations, model, plan });
     }
 
     #[test]

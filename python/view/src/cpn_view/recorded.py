@@ -16,9 +16,6 @@ from cpn_view import panels
 Show = Callable[[rr.RecordingStream, Any], None]
 """Function that logs a message at the current time."""
 
-RED, GREEN, BLUE, BROWN = panels.ACTION_COLORS
-MS_PER_SECOND = 1e3
-
 
 @dataclass(frozen=True)
 class Kind:
@@ -61,9 +58,8 @@ def _trial(stream: rr.RecordingStream, trial: Any) -> None:
     _series(stream, "plan/first_action", list(panels.ACTION_NAMES), *panels.ACTION_COLORS)
     for name, color in zip(panels.ACTION_NAMES, panels.ACTION_COLORS, strict=True):
         _series(stream, f"plan/actions/{name}", [name], color)
-    _series(stream, "plan/inner_loss", ["before the search", "of the plan"], BROWN, BLUE)
-    _series(stream, "plan/latent_distance", ["latent distance"], RED)
-    _series(stream, "plan/times_ms", ["queue", "encode", "plan"], BROWN, GREEN, BLUE)
+    for name, series in panels.PLAN_SERIES.items():
+        stream.log(f"plan/{name}", series, static=True)
 
 
 def _plan(stream: rr.RecordingStream, plan: Any) -> None:
@@ -72,13 +68,7 @@ def _plan(stream: rr.RecordingStream, plan: Any) -> None:
     actions = np.array([action.values for action in plan.actions])
     for name, values in zip(panels.ACTION_NAMES, actions.T, strict=False):
         stream.log(f"plan/actions/{name}", rr.Scalars(values))
-    if plan.inner_losses:
-        stream.log("plan/inner_loss", rr.Scalars([plan.inner_losses[0], plan.inner_losses[-1]]))
-        stream.log("plan/inner_losses", rr.BarChart(plan.inner_losses, color=BLUE))
-    if plan.HasField("latent_distance"):
-        stream.log("plan/latent_distance", rr.Scalars(plan.latent_distance))
-    times = (plan.times.queue_seconds, plan.times.encode_seconds, plan.times.plan_seconds)
-    stream.log("plan/times_ms", rr.Scalars([MS_PER_SECOND * seconds for seconds in times]))
+    panels.plan(stream, "plan", plan)
 
 
 def _trial_views() -> rrb.Container:
@@ -118,8 +108,8 @@ def _demonstration(stream: rr.RecordingStream, episode: Any) -> None:
     ]
     stream.log("demonstration", rr.TextDocument("\n".join(lines)), static=True)
     _series(stream, "action", list(panels.ACTION_NAMES), *panels.ACTION_COLORS)
-    _series(stream, "reward", ["reward"], BLUE)
-    _series(stream, "success", ["success"], GREEN)
+    _series(stream, "reward", ["reward"], panels.BLUE)
+    _series(stream, "success", ["success"], panels.GREEN)
 
 
 def _step(stream: rr.RecordingStream, step: Any) -> None:

@@ -1,0 +1,135 @@
+"""Panel of a simulator worker: messages as entities under /workers/NAME."""
+
+import math
+from collections.abc import Sized
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from cpn.v1 import sim_pb2, trial_pb2
+from cpn_view import panels
+
+MAX_DEGREES = 180
+
+
+def entity(worker: str, *names: str) -> str:
+    """Path of an entity of a worker."""
+    return rr.new_entity_path(["workers", worker, *names])
+
+
+class Worker:
+    """A worker's episode, and the share of its episodes that were solved."""
+
+    def __init__(self, stream: rr.RecordingStream, name: str) -> None:
+        self._stream = stream
+        self._name = name
+        self._frame: sim_pb2.Frame | None = None
+        self._drawn = True
+        self._acting = ""
+        """Id of the episode of the last action."""
+        self._solved: set[str] = set()
+        self._episodes = 0
+
+    def frame(self, frame: sim_pb2.Frame) -> None:
+        """Takes a frame, which `draw` shows unless a later one comes before.
+
+        Raises:
+            ValueError: If a field is malformed.
+        """
+        _check(frame)
+        if self._frame is None or frame.episode_id != self._frame.episode_id:
+            self._start(frame)
+        self._frame, self._drawn = frame, False
+        if frame.success:
+            self._solved.add(frame.episode_id)
+
+    def action(self, message: sim_pb2.AppliedAction) -> None:
+        """Shows an applied action."""
+        if self._acting != message.episode_id:
+            self._acting = message.episode_id
+            # A gap between the lines of two episodes.
+            self._log("action", rr.Clear(recursive=False))
+        self._log("action", rr.Scalars(message.action.values))
+
+    def plan(self, message: trial_pb2.TrialPlan) -> None:
+        """Shows a plan, and the positions of the hand under it if its episode is the one shown.
+
+        Raises:
+            ValueError: If the actions differ in length, or have less than three values.
+        """
+        panels.plan(self._stream, entity(self._name, "plan"), message.plan)
+        frame = self._frame
+        if frame and frame.HasField("camera") and frame.episode_id == message.episode_id:
+            actions = np.array([action.values for action in message.plan.actions])
+            if actions.ndim != 2 or actions.shape[1] < 3:
+                raise ValueError(f"plan.actions: expected [H, A] with A at least 3, got {actions.shape}")
+            path = planned_positions(frame, actions)
+            self._log("path", rr.LineStrips3D([path], radii=rr.Radius.ui_points(1.5), colors=panels.GREEN))
+
+    def draw(self) -> None:
+        """Shows the latest frame, once."""
+        frame = self._frame
+        if frame is None or self._drawn:
+            return
+        self._drawn = True
+        self._log("camera", panels.image_of(frame.image))
+        self._log("progress", rr.Scalars(frame.progress))
+        lines = [
+            f"{frame.episode_id}, step {frame.step}",
+            "solved" if frame.success else f"progress {frame.progress:.2f}",
+            f"{len(self._solved)} of {self._episodes} episodes solved so far",
+        ]
+        self._log("episode", rr.TextDocument("\n".join(lines)))
+
+    def leave(self) -> None:
+        """Says that the worker is gone."""
+        self._log("episode", rr.TextDocument("The worker is gone."))
+
+    def _start(self, frame: sim_pb2.Frame) -> None:
+        """Starts an episode: its goal, and the camera's pose, which places positions in the image."""
+        if frame.HasField("goal"):
+            self._log("goal", panels.image_of(frame.goal))
+        self._episodes += 1
+        self._log("path", rr.Clear(recursive=False))
+        self._log("progress", rr.Clear(recursive=False))
+        if not frame.HasField("camera"):
+            return
+        rotation = np.reshape(frame.camera.rotation, (3, 3))
+        self._log("camera", rr.Transform3D(translation=frame.camera.position, mat3x3=rotation))
+        width, height = frame.image.width, frame.image.height
+        focal_pixels = height / 2 / math.tan(math.radians(frame.camera.field_of_view_degrees) / 2)
+        axes = rr.ViewCoordinates.RUB
+        self._log("camera", rr.Pinhole(focal_length=focal_pixels, width=width, height=height, camera_xyz=axes))
+
+    def _log(self, name: str, contents: rr.AsComponents) -> None:
+        self._stream.log(entity(self._name, name), contents)
+
+
+def planned_positions(frame: sim_pb2.Frame, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions of the hand's set point under planned actions, [1 + H, 3] in metres, from the position in the frame on.
+
+    Args:
+        frame: Frame with the hand's position and the control.
+        actions: [H, A], clipped to [-1, 1].
+    """
+    steps = frame.control.metres * np.clip(actions[:, :3], -1, 1)
+    return np.array(frame.hand_position) + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _check(frame: sim_pb2.Frame) -> None:
+    panels.image_of(frame.image)
+    if frame.HasField("goal"):
+        panels.image_of(frame.goal)
+    if frame.HasField("camera"):
+        _check_length("camera.position", frame.camera.position, 3)
+        _check_length("camera.rotation", frame.camera.rotation, 9)
+        _check_length("hand_position", frame.hand_position, 3)
+        if not 0 < frame.camera.field_of_view_degrees < MAX_DEGREES:
+            got = frame.camera.field_of_view_degrees
+            raise ValueError(f"camera.field_of_view_degrees: expected above 0 and below {MAX_DEGREES}, got {got}")
+
+
+def _check_length(field: str, values: Sized, expected: int) -> None:
+    if len(values) != expected:
+        raise ValueError(f"{field}: expected {expected} numbers, got {len(values)}")
