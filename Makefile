@@ -110,8 +110,8 @@ experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the exp
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
 	done
 
-ablations: build ## Train CPN with other losses, two seeds each, and evaluate on the development tasks; goes on where it was interrupted
-	$(WORKER)/bin/python experiments/ablations.py
+ablations: build ## Train with other losses and dynamics, two seeds each, and evaluate on tasks left out, six at once (GROUPS="reported-1 reported-2 reported-3"); goes on where it was interrupted
+	$(WORKER)/bin/python experiments/ablations.py $(if $(GROUPS),--groups $(GROUPS))
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	$(WORKER)/bin/python experiments/models.py

@@ -1,23 +1,34 @@
-"""Ablations of losses and noise injection on the development tasks, which are left out of training all at once.
+"""Ablations of losses, dynamics and noise injection on tasks that are left out of training, six at once.
 
-Interrupted, it goes on. Each run's outcomes are kept in docs/results/ablations, of which --table makes the table.
+Recipes are chosen by the development tasks; the arms in `REPORTED_ARMS` are then run on the 18 others. Interrupted, it
+goes on. Each run's outcomes are kept in docs/results/ablations, of which --table makes the tables.
 """
 
 import argparse
 import json
+import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from dataset import DATASET, record
-from lab import ROOT, Lab, main, on_every_core, train
+from lab import ROOT, Lab, main, train
+from scipy.stats import binomtest
 
 RESULTS = ROOT / "docs/results/ablations"
 DEVELOPMENT = ("coffee-button", "dial-turn", "door-lock", "drawer-close", "handle-press", "handle-pull")
 """The four tasks that the paper names, and two that `random.Random(0)` drew of the 20 others, in the order of names."""
 TRAINED = ("plate-slide", "window-close")
-"""Tasks of the training demonstrations, on other variations."""
+"""Tasks of the training demonstrations of the development tasks, on other variations."""
+REPORTED = {
+    "reported-1": ("assembly", "basketball", "button-press", "button-press-topdown", "coffee-pull", "disassemble"),
+    "reported-2": ("door-close", "door-open", "door-unlock", "drawer-open", "faucet-close", "faucet-open"),
+    "reported-3": ("lever-pull", "peg-insert-side", "plate-slide", "reach", "window-close", "window-open"),
+}
+"""The 18 other tasks by name, in groups that are left out at once."""
+GROUPS = {"development": DEVELOPMENT} | REPORTED
 
 SETTINGS = {"training.epochs": 3, "training.samples_per_draw": 8, "training.precision": "bfloat16"}
 EVERY_UPDATE = {"training.losses.every_update": "true"}
@@ -28,6 +39,7 @@ NOISY, NOISE, NOISY_EPISODES = ROOT / "data/demonstrations-noise", 0.3, 50
 NOISY_EPOCHS = {"training.epochs": 6}
 """As many updates of the weights as with twice the episodes and half the epochs."""
 AUGMENTED = {"training.goals": "hindsight", "training.shift_pixels": 4}
+POSITION_DYNAMICS = {"model.position_dynamics": "true", "model.updates": 5} | DYNAMICS | POSITION
 
 
 @dataclass(frozen=True)
@@ -39,6 +51,8 @@ class Arm:
     method: str = "cpn"
     noise: float = 0
     """Noise injection of the demonstrations."""
+    updates: tuple[int, ...] = (0, 1, 5)
+    """Numbers of updates to plan with, of a method that plans."""
 
     @property
     def dataset(self) -> Path:
@@ -56,67 +70,124 @@ ARMS = {
     "every-update": Arm(EVERY_UPDATE),
     "every-update-dynamics": Arm(EVERY_UPDATE | DYNAMICS),
     "every-update-dynamics-position": Arm(EVERY_UPDATE | DYNAMICS | POSITION),
+    "te-bc": Arm(method="te-bc"),
+    "position-te-bc": Arm(POSITION, "te-bc"),
+    "position-dynamics": Arm(POSITION_DYNAMICS, updates=(0, 1, 2, 5, 20)),
     "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISE),
     "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISE),
     "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
     "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, noise=NOISE),
     "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, noise=NOISE),
 }
+REPORTED_ARMS = {"te-bc": (0,), "position-te-bc": (0,), "paper": (1,), "position-dynamics": (0, 5)}
+"""Arms that are run on the reported tasks, with their numbers of updates."""
 SEEDS = (0, 1)
-UPDATES = (0, 1, 5)
 TRIALS = 20
 
 Outcomes = dict[str, dict[str, list[int]]]
 """1 for a success, 0 for a failure, of each variation in the order of seeds, by number of updates and task."""
 
 
-def run(arm: str, seed: int) -> None:
+@dataclass(frozen=True)
+class Cell:
+    """An arm trained with a seed on all tasks but a group."""
+
+    group: str
+    arm: str
+    seed: int
+
+    @property
+    def result(self) -> Path:
+        """File of the outcomes."""
+        folder = RESULTS if self.group == "development" else RESULTS / self.group
+        return folder / f"{self.arm}-{self.seed}.json"
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Evaluated tasks."""
+        return GROUPS[self.group] + (TRAINED if self.group == "development" else ())
+
+    @property
+    def updates(self) -> tuple[int, ...]:
+        """Numbers of updates to plan with; 0 alone for a method that does not plan."""
+        if self.group != "development":
+            return REPORTED_ARMS[self.arm]
+        return ARMS[self.arm].updates if ARMS[self.arm].plans else (0,)
+
+    def outcomes(self) -> Outcomes:
+        """Kept outcomes; none if the cell was not run."""
+        return json.loads(self.result.read_text())["successes"] if self.result.exists() else {}
+
+
+def run(cell: Cell) -> None:
     """Trains and evaluates an arm on one core, and keeps the outcomes."""
-    out, recipe = ROOT / f"runs/ablations/{arm}-{seed}", ARMS[arm]
+    out, recipe = ROOT / f"runs/ablations/{cell.group}/{cell.arm}-{cell.seed}", ARMS[cell.arm]
     checkpoint = out / f"models/{recipe.method}.safetensors"
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
     settings = SETTINGS | recipe.settings
-    options = ["--preset", f"paper-{recipe.method}", "--dataset", str(recipe.dataset), "--seed", str(seed)]
-    options += ["--hold-out", ",".join(DEVELOPMENT), "--run-dir", str(out / "run")]
+    options = ["--preset", f"paper-{recipe.method}", "--dataset", str(recipe.dataset), "--seed", str(cell.seed)]
+    options += ["--hold-out", ",".join(GROUPS[cell.group]), "--run-dir", str(out / "run")]
     options += [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
     with Lab(out) as lab:
         if not checkpoint.exists():
             train(lab, checkpoint, *options)
         lab.planner(checkpoint.parent)
         lab.worker("w0")
-        search = ["--models", recipe.method, "--tasks", ",".join(DEVELOPMENT + TRAINED), "--trials", str(TRIALS)]
-        for updates in UPDATES if recipe.plans else (0,):
+        search = ["--models", recipe.method, "--tasks", ",".join(cell.tasks), "--trials", str(TRIALS)]
+        for updates in cell.updates:
             choice = ["--updates", str(updates)] if recipe.plans else []
             lab.evaluate(*search, *choice, "--out", str(out / f"updates-{updates}"))
-    keep(arm, seed, out)
+    keep(cell, out)
 
 
-def keep(arm: str, seed: int, out: Path) -> None:
+def keep(cell: Cell, out: Path) -> None:
     """Keeps the outcomes of an arm's records."""
-    successes: Outcomes = {}
-    for folder in sorted(out.glob("updates-*")):
-        for path in sorted(folder.glob(f"trials/*/{ARMS[arm].method}/*.json")):
+    recipe, successes = ARMS[cell.arm], Outcomes()
+    for updates in cell.updates:
+        by_task = successes.setdefault(str(updates), {})
+        for path in sorted(out.glob(f"updates-{updates}/trials/*/{recipe.method}/*.json")):
             trial = json.loads(path.read_text())
-            by_task = successes.setdefault(folder.name.removeprefix("updates-"), {})
             by_task.setdefault(trial["task"], []).append(int(trial["outcome"] == "success"))
-    recipe = ARMS[arm]
-    result = {"arm": arm, "seed": seed, "method": recipe.method, "noise": recipe.noise}
-    result |= {"settings": SETTINGS | recipe.settings, "successes": successes}
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{arm}-{seed}.json").write_text(json.dumps(result) + "\n")
+    result = {"arm": cell.arm, "seed": cell.seed, "method": recipe.method, "noise": recipe.noise}
+    result |= {"held_out": GROUPS[cell.group], "settings": SETTINGS | recipe.settings, "successes": successes}
+    cell.result.parent.mkdir(parents=True, exist_ok=True)
+    cell.result.write_text(json.dumps(result) + "\n")
 
 
-def table() -> str:
-    """Successes by arm, training seed and number of updates, in Markdown."""
+def development_table() -> str:
+    """Successes on the development tasks by arm, training seed and number of updates, in Markdown."""
     lines = ["| arm | seed | U | development | trained | " + " | ".join(DEVELOPMENT) + " |"]
     lines.append("|---" * (5 + len(DEVELOPMENT)) + "|")
     for arm, seed in product(ARMS, SEEDS):
-        path = RESULTS / f"{arm}-{seed}.json"
-        outcomes: Outcomes = json.loads(path.read_text())["successes"] if path.exists() else {}
-        for updates, by_task in outcomes.items():
+        for updates, by_task in Cell("development", arm, seed).outcomes().items():
             total = ["/".join(map(str, _count(by_task, tasks))) for tasks in (DEVELOPMENT, TRAINED)]
             each = [str(sum(by_task[task])) for task in DEVELOPMENT]
             lines.append(f"| {arm} | {seed} | {updates} | " + " | ".join(total + each) + " |")
+    return "\n".join(lines)
+
+
+def reported_table() -> str:
+    """Successes on the reported tasks by arm and number of updates, with Wilson intervals, in Markdown.
+
+    The rows of all groups and seeds that were run.
+    """
+    arms: dict[tuple[str, str], dict[str, list[int]]] = {}
+    for arm, group, seed in product(REPORTED_ARMS, REPORTED, SEEDS):
+        for updates, by_task in Cell(group, arm, seed).outcomes().items():
+            row = arms.setdefault((arm, updates), {})
+            for task, outcomes in by_task.items():
+                row.setdefault(task, []).extend(outcomes)
+    tasks = [task for group in REPORTED.values() for task in group]
+    names = [f"{arm}, U = {updates}" if ARMS[arm].plans else arm for arm, updates in arms]
+    lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
+    for task in tasks:
+        counts = [_count(row, (task,)) if task in row else None for row in arms.values()]
+        lines.append(f"| {task} | " + " | ".join("/".join(map(str, count)) if count else "" for count in counts) + " |")
+    totals = [_count(row, tuple(row)) for row in arms.values()]
+    lines.append("| all | " + " | ".join(f"{solved}/{trials}" for solved, trials in totals) + " |")
+    intervals = [binomtest(*total).proportion_ci(method="wilson") for total in totals]
+    percent = [f"{100 * interval.low:.0f} to {100 * interval.high:.0f}" for interval in intervals]
+    lines.append("| 95 %, in per cent | " + " | ".join(percent) + " |")
     return "\n".join(lines)
 
 
@@ -127,14 +198,31 @@ def _count(by_task: dict[str, list[int]], tasks: tuple[str, ...]) -> tuple[int, 
 
 
 def ablations() -> None:
-    """Runs all arms and prints the table, or prints the table alone."""
+    """Runs all arms and prints the tables, or prints the tables alone."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", action="store_true", help="print the table of the kept outcomes, and run nothing")
-    if not parser.parse_args().table:
+    parser.add_argument("--table", action="store_true", help="print the tables of the kept outcomes, and run nothing")
+    parser.add_argument(
+        "--groups", nargs="+", choices=GROUPS, default=["development"], help="groups of tasks to leave out"
+    )
+    parser.add_argument(
+        "--arms", nargs="+", choices=ARMS, help="arms to run, by default all, or the reported ones of a reported group"
+    )
+    parser.add_argument("--seeds", nargs="+", type=int, choices=SEEDS, default=SEEDS, help="training seeds")
+    arguments = parser.parse_args()
+    if not arguments.table:
+        cells = [
+            Cell(group, arm, seed)
+            for group, seed in product(arguments.groups, arguments.seeds)
+            for arm in arguments.arms or (ARMS if group == "development" else REPORTED_ARMS)
+        ]
         record()
-        record(NOISY, NOISY_EPISODES, NOISE)
-        on_every_core(lambda cell: run(*cell), product(ARMS, SEEDS))
-    print(table())
+        if any(ARMS[cell.arm].noise for cell in cells):
+            record(NOISY, NOISY_EPISODES, NOISE)
+        # In processes, since each cell has a lab, whose signal handlers are for a process's main thread.
+        with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            for _ in pool.map(run, cells):
+                pass
+    print(development_table(), reported_table(), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -86,14 +86,16 @@ impl Agent {
         let cloning = cloning.sum::<Tensor>() / cloned.len() as f64;
         let Some(next) = next else { return cloning };
         let states = Tensor::stack(&self.inner_loop().states(x, x_g, &batch.applied_actions), 1);
-        cloning + loss::mean_squared(&states, &next.view_as(&states), &batch.mask) * losses.dynamics
+        let compared = |states: &Tensor| states.narrow(2, 0, self.config.compared_elements());
+        let (predicted, later) = (compared(&states), compared(&next.view_as(&states)));
+        cloning + loss::mean_squared(&predicted, &later, &batch.mask) * losses.dynamics
     }
 
     /// Planned actions before and after every update, `[B, H, A]` each, from x to x_g, both `[B, Z]`, with their graph;
     /// `steps_left` is k, `[B]`.
     fn plans_differentiably(&self, x: &Tensor, x_g: &Tensor, steps_left: &Tensor) -> Vec<Tensor> {
         if self.config.method.plans() {
-            self.inner_loop().plans_differentiably(x, x_g)
+            self.inner_loop().plans_differentiably(x, x_g, self.config.trained_updates())
         } else {
             vec![self.react(x, x_g, steps_left)]
         }
@@ -111,6 +113,7 @@ impl Agent {
             step_size: &self.step_size,
             horizon: self.config.horizon,
             updates: self.config.updates,
+            compared: self.config.compared_elements(),
         }
     }
 

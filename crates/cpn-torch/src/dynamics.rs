@@ -11,6 +11,8 @@ pub struct PolicyDynamics {
     trunk: Dense,
     policy: [Dense; 2],
     dynamics: Option<[Dense; 2]>,
+    /// Motion of the position, the first P elements of a state, by an action, `[P, A]`.
+    position: Option<Tensor>,
     goal_conditioned: bool,
 }
 
@@ -27,6 +29,9 @@ impl PolicyDynamics {
             dynamics: method
                 .plans()
                 .then(|| [dense("dynamics_0", hidden + actions, hidden), dense("dynamics_1", hidden, latent)]),
+            position: config
+                .position_dynamics
+                .then(|| (path / "position").zeros("weight", &[config.compared_elements(), actions])),
             goal_conditioned: method.is_goal_conditioned(),
         }
     }
@@ -43,13 +48,18 @@ impl PolicyDynamics {
         self.policy[1].forward(&self.policy[0].forward(features).relu()).tanh()
     }
 
-    /// The dynamics branch: the state `[B, Z]` after an action `[B, A]`, predicted as a difference to x.
+    /// The dynamics branch: the state `[B, Z]` after an action `[B, A]`, predicted as a difference to x, whose first elements are linear
+    /// in the action with position dynamics.
     ///
     /// # Panics
     /// If the method does not plan.
     pub fn next(&self, x: &Tensor, features: &Tensor, action: &Tensor) -> Tensor {
         let [first, second] = self.dynamics.as_ref().expect("only planning methods roll out");
-        x + second.forward(&first.forward(&Tensor::cat(&[features, action], 1)).relu())
+        let change = second.forward(&first.forward(&Tensor::cat(&[features, action], 1)).relu());
+        let Some(position) = &self.position else { return x + change };
+        let size = position.size()[0];
+        let rest = change.narrow(1, size, change.size()[1] - size);
+        x + Tensor::cat(&[action.matmul(&position.tr()), rest], 1)
     }
 }
 

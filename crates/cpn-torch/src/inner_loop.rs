@@ -27,6 +27,8 @@ pub struct InnerLoop<'a> {
     pub horizon: i64,
     /// U, the number of updates.
     pub updates: i64,
+    /// Number of elements of a state, from the first on, that the loss compares.
+    pub compared: i64,
 }
 
 impl InnerLoop<'_> {
@@ -47,11 +49,11 @@ impl InnerLoop<'_> {
         TensorPlan { actions, inner_losses }
     }
 
-    /// The plans of [`Self::plan`] before and after every update, `[B, H, A]` each, with the graph of all updates, for the outer
-    /// loop.
-    pub fn plans_differentiably(&self, x: &Tensor, x_g: &Tensor) -> Vec<Tensor> {
+    /// The plans of [`Self::plan`] before and after each of `updates` updates, `[B, H, A]` each, with the graph of all updates, for
+    /// the outer loop.
+    pub fn plans_differentiably(&self, x: &Tensor, x_g: &Tensor, updates: i64) -> Vec<Tensor> {
         let mut plans = vec![self.policy_rollout(x, x_g)];
-        for k in 0..self.updates as usize {
+        for k in 0..updates as usize {
             let (_, gradient) = self.loss_and_gradient(x, x_g, &plans[k], true);
             plans.push(&plans[k] - self.step_size * gradient);
         }
@@ -85,10 +87,11 @@ impl InnerLoop<'_> {
     }
 
     /// Inner losses, `[B]`: Huber loss between the predicted state after `actions`, `[B, H, A]`, and the goal, summed over the
-    /// latent.
+    /// compared elements.
     pub fn loss(&self, x: &Tensor, x_g: &Tensor, actions: &Tensor) -> Tensor {
         let states = self.states(x, x_g, actions);
-        let error = states[states.len() - 1].huber_loss(x_g, Reduction::None, HUBER_DELTA);
+        let compared = |states: &Tensor| states.narrow(1, 0, self.compared);
+        let error = compared(&states[states.len() - 1]).huber_loss(&compared(x_g), Reduction::None, HUBER_DELTA);
         error.sum_dim_intlist(1, false, None::<Kind>)
     }
 

@@ -1,5 +1,6 @@
 //! Configuration of a model: method, encoder, sizes.
 
+use crate::positions;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -226,13 +227,28 @@ pub struct ModelConfig {
     pub horizon: i64,
     /// U, the number of gradient updates of a plan; 0 for methods that do not plan.
     pub updates: i64,
+    /// True if the first three elements of a state are the position of the hand: an action moves them by a linear function of its
+    /// own, and the inner loss compares them alone. Such plans are not trained through their updates: the policy's is cloned.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub position_dynamics: bool,
 }
 
 impl ModelConfig {
     /// The paper's values: layers of width 32, 4 actions, H = 5, U = 1.
     pub fn paper(method: MethodKind) -> Self {
         let (horizon, updates) = if method.plans() { (5, 1) } else { (1, 0) };
-        Self { method, encoder: EncoderConfig::paper(), hidden: 32, gate_hidden: 32, actions: 4, horizon, updates }
+        let (encoder, position_dynamics) = (EncoderConfig::paper(), false);
+        Self { method, encoder, hidden: 32, gate_hidden: 32, actions: 4, horizon, updates, position_dynamics }
+    }
+
+    /// Number of elements of a state, from the first on, that the inner loss and the dynamics loss compare.
+    pub fn compared_elements(&self) -> i64 {
+        if self.position_dynamics { positions::SIZE } else { self.encoder.latent() }
+    }
+
+    /// Number of updates that training differentiates through.
+    pub fn trained_updates(&self) -> i64 {
+        if self.position_dynamics { 0 } else { self.updates }
     }
 
     /// Width of the input of g_θ's trunk: x, x_g if the method is goal-conditioned, and k if it takes the number of steps left.
@@ -252,12 +268,16 @@ impl ModelConfig {
         in_range("hidden", self.hidden, 1, 256)?;
         in_range("gate_hidden", self.gate_hidden, 1, 64)?;
         in_range("actions", self.actions, 1, 32)?;
+        if self.position_dynamics {
+            in_range("encoder.latent", self.encoder.latent(), positions::SIZE, 512)?;
+        }
         if self.method.plans() {
             in_range("horizon", self.horizon, 1, 64)?;
             in_range("updates", self.updates, 0, 64)
         } else {
             in_range("horizon", self.horizon, 1, 1)?;
-            in_range("updates", self.updates, 0, 0)
+            in_range("updates", self.updates, 0, 0)?;
+            in_range("position_dynamics", self.position_dynamics.into(), 0, 0)
         }
     }
 }

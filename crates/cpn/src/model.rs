@@ -10,6 +10,13 @@ use rand_chacha::ChaCha8Rng;
 /// training.
 const GATE_BIAS: f32 = 2.0;
 
+/// α of position dynamics, which are not trained through updates. In standard deviations of the position an action moves the hand by
+/// some hundredths, so that an update with α = 1 would hardly change an action.
+const POSITION_STEP_SIZE: f32 = 20.0;
+
+/// Bound of the initial motion of the position by an action, in standard deviations of the position.
+const POSITION_MOTION: f32 = 0.1;
+
 /// A model: configuration and weights of the encoder f_φ, of g_θ and of the inner loop's step size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
@@ -61,7 +68,8 @@ pub fn parameters(config: &ModelConfig) -> Vec<Parameter> {
     let mut list = Parameters(Vec::new());
     list.encoder(&config.encoder);
     list.network(config);
-    list.push("step_size", &[], Init::Constant(1.0));
+    let step_size = if config.position_dynamics { POSITION_STEP_SIZE } else { 1.0 };
+    list.push("step_size", &[], Init::Constant(step_size));
     list.0
 }
 
@@ -136,6 +144,9 @@ impl Parameters {
         if method.plans() {
             self.dense("network.dynamics_0", hidden + actions, hidden, config);
             self.dense("network.dynamics_1", hidden, latent, config);
+        }
+        if config.position_dynamics {
+            self.push("network.position.weight", &[positions::SIZE, actions], Init::Uniform(POSITION_MOTION));
         }
     }
 

@@ -87,6 +87,9 @@ pub enum Preset {
     PaperCpn,
     /// Contextual planning network with our faster training: a tenth of the epochs, shared goals, and bfloat16.
     Cpn,
+    /// As `cpn`, with position dynamics: five updates lead the hand to its position in the goal picture, for tasks without
+    /// demonstrations.
+    CpnPosition,
     /// Contextual planning network of positions in the Jenga scene (section "JENGA domain on a physical robot").
     Jenga,
 }
@@ -99,13 +102,14 @@ const JENGA_SCALE_MM: i64 = 62;
 
 impl Preset {
     /// All presets, in the order of lists.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::PaperBc,
         Self::PaperTeBc,
         Self::PaperTeBcHorizon,
         Self::PaperUpn,
         Self::PaperCpn,
         Self::Cpn,
+        Self::CpnPosition,
         Self::Jenga,
     ];
 
@@ -118,6 +122,7 @@ impl Preset {
             Self::PaperUpn => "paper-upn",
             Self::PaperCpn => "paper-cpn",
             Self::Cpn => "cpn",
+            Self::CpnPosition => "cpn-position",
             Self::Jenga => "jenga",
         }
     }
@@ -144,6 +149,16 @@ impl Preset {
                     ..Training::paper()
                 },
             },
+            Self::CpnPosition => {
+                let Recipe { model, training } = Self::Cpn.recipe();
+                Recipe {
+                    model: ModelConfig { position_dynamics: true, updates: 5, ..model },
+                    training: Training {
+                        losses: Losses { every_update: false, dynamics: 0.5, position: 0.3 },
+                        ..training
+                    },
+                }
+            }
             Self::Jenga => Recipe {
                 model: ModelConfig {
                     encoder: EncoderConfig::position(JENGA_CENTRE_MM, JENGA_SCALE_MM),
@@ -204,7 +219,7 @@ impl Training {
 
 impl Recipe {
     /// Checks every value against its range. Augmentation and the position loss are allowed only with images, losses of plans only
-    /// for methods that plan.
+    /// for methods that plan. Position dynamics need the dynamics loss and, with images, the position loss.
     ///
     /// # Errors
     /// The first field out of its range, with the range and the value.
@@ -221,6 +236,17 @@ impl Recipe {
         }
         if self.training.losses.position > 0.0 {
             in_range("encoder.latent", self.model.encoder.latent(), 3, 512)?;
+        }
+        if self.model.position_dynamics {
+            let Losses { every_update, dynamics, position } = self.training.losses;
+            in_range("training.losses.every_update", every_update.into(), 0, 0)?;
+            let of_images =
+                (self.model.encoder.input() == Input::Image).then_some(("training.losses.position", position));
+            for (field, weight) in [("training.losses.dynamics", dynamics)].into_iter().chain(of_images) {
+                if weight == 0.0 {
+                    return Err(ConfigError::new(field, weight, "above 0 (with position_dynamics)", 1e6));
+                }
+            }
         }
         if !self.model.method.plans() {
             let Losses { every_update, dynamics, .. } = self.training.losses;

@@ -109,6 +109,18 @@ fn losses_of_every_update_and_of_the_dynamics_agree_with_autograd() {
     }
 }
 
+#[test]
+fn position_dynamics_agree_with_autograd() {
+    for (method, dynamics) in [(MethodKind::Upn, 0.7), (MethodKind::Cpn, 0.7), (MethodKind::Cpn, 0.0)] {
+        for (horizon, updates) in [(1, 1), (5, 2)] {
+            let config = ModelConfig { horizon, updates, position_dynamics: true, ..small_config(method) };
+            for (rows, threads) in [(1, 1), (70, 3)] {
+                check(config.clone(), Losses { dynamics, ..Losses::default() }, rows, threads);
+            }
+        }
+    }
+}
+
 /// At the paper's size a gate has several ranges; with 33 outputs the last one is smaller.
 #[test]
 fn gates_of_several_ranges_agree_with_autograd() {

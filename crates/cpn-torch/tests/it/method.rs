@@ -102,7 +102,7 @@ fn plans_of_training_and_serving_are_equal() {
     let (x, x_g) = (uniform(&[2, 6], 1), uniform(&[2, 6], 2));
     let inner_loop = InnerLoop { updates: 3, ..agent.inner_loop() };
     let served = inner_loop.plan(&x, &x_g);
-    let trained = inner_loop.plans_differentiably(&x, &x_g);
+    let trained = inner_loop.plans_differentiably(&x, &x_g, 3);
     assert!(max_difference(&served.actions, &trained[3]) < 1e-12);
     assert_eq!((served.inner_losses.len(), trained.len()), (4, 4));
 }

@@ -78,7 +78,8 @@ fn assert_close(what: &str, ours: impl Iterator<Item = f32>, reference: &[f64], 
     assert_eq!(ours.len(), reference.len(), "{what}");
     for (ours, reference) in ours.iter().zip(reference) {
         let error = (f64::from(*ours) - reference).abs();
-        assert!(error < TOLERANCE * scale + 4.0 * rounding, "{what}: {ours} for {reference}, which {rounding:e} move");
+        // Float32 rounds at every step of a rollout, the perturbation is of the first state only.
+        assert!(error < TOLERANCE * scale + 8.0 * rounding, "{what}: {ours} for {reference}, which {rounding:e} move");
     }
 }
 
@@ -87,14 +88,16 @@ fn farthest(a: &[f64], b: &[f64]) -> f64 {
 }
 
 fn sizes() -> impl Strategy<Value = ModelConfig> {
-    (proptest::sample::select(&MethodKind::ALL[..]), 1i64..70, 1i64..40, 1i64..40, 1i64..6, 1i64..9, 0i64..4).prop_map(
-        |(method, latent, hidden, gate_hidden, actions, horizon, updates)| {
+    let method = (proptest::sample::select(&MethodKind::ALL[..]), proptest::bool::ANY);
+    (method, 1i64..70, 1i64..40, 1i64..40, 1i64..6, 1i64..9, 0i64..4).prop_map(
+        |((method, position), latent, hidden, gate_hidden, actions, horizon, updates)| {
             let mut config = position_config(method);
             if let EncoderConfig::Position(encoder) = &mut config.encoder {
                 encoder.latent = latent;
             }
             let (horizon, updates) = if method.plans() { (horizon, updates) } else { (1, 0) };
-            ModelConfig { hidden, gate_hidden, actions, horizon, updates, ..config }
+            let position_dynamics = position && method.plans() && latent >= 3;
+            ModelConfig { hidden, gate_hidden, actions, horizon, updates, position_dynamics, ..config }
         },
     )
 }

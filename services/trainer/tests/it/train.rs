@@ -3,7 +3,7 @@
 use crate::common::{SPEC, episode, info, keep, steps};
 use cpn::engine::OuterLoss;
 use cpn::recipe::GoalSampling;
-use cpn::{Input, Losses, MethodKind, ModelConfig, Precision, Preset, Training, checkpoint};
+use cpn::{Input, Losses, ModelConfig, Precision, Preset, Recipe, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
 use trainer::training::config::Config;
@@ -112,13 +112,23 @@ fn a_saved_state_of_another_run_is_refused() {
 #[test]
 fn a_checkpoint_has_its_provenance() {
     let folder = tempfile::tempdir().unwrap();
-    for method in MethodKind::ALL {
-        let config = config(folder.path(), method.name());
-        let config = Config { model: ModelConfig::paper(method), hold_out: vec!["door-lock".into()], ..config };
+    let presets = [
+        Preset::PaperBc,
+        Preset::PaperTeBc,
+        Preset::PaperTeBcHorizon,
+        Preset::PaperUpn,
+        Preset::Cpn,
+        Preset::CpnPosition,
+    ];
+    for preset in presets {
+        let Recipe { model, training: Training { losses, .. } } = preset.recipe();
+        let config = config(folder.path(), preset.name());
+        let training = Training { losses, ..config.training };
+        let config = Config { model, training, hold_out: vec!["door-lock".into()], ..config };
         let digest = finished(&config);
         let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
         assert_eq!(loaded.digest, digest);
-        assert_eq!(loaded.model.config.method, method);
+        assert_eq!(loaded.model.config, config.model);
         assert_eq!(loaded.provenance.training_tasks, ["reach"]);
         assert_eq!((loaded.provenance.seed, &loaded.provenance.training), (4, &config.training));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
@@ -227,6 +237,10 @@ fn settings_are_checked_before_files_are_read() {
         ("out=models/..", "out: expected the path of a file, got \"models/..\""),
         ("hold_out=[\"reach\", \"\"]", "hold_out: expected tasks, each once, got [\"reach\", \"\"]"),
         ("hold_out=[\"reach\", \"reach\"]", "hold_out: expected tasks, each once, got [\"reach\", \"reach\"]"),
+        (
+            "model.position_dynamics=true",
+            "training.losses.dynamics: expected above 0 (with position_dynamics) to 1000000, got 0",
+        ),
     ] {
         assert_eq!(format!("{:#}", load(change).unwrap_err()), reason);
     }

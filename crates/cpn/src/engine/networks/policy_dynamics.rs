@@ -9,6 +9,10 @@ use crate::engine::layers::relu::{relu, relu_mask};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
+use crate::positions;
+
+/// P, the number of elements of a position.
+const POSITION: usize = positions::SIZE as usize;
 
 /// Names of the branches' layers.
 const POLICY: [&str; 2] = ["policy_0", "policy_1"];
@@ -20,6 +24,8 @@ pub struct PolicyDynamics<T> {
     trunk: Dense<T>,
     policy: [Dense<T>; 2],
     dynamics: Option<[Dense<T>; 2]>,
+    /// Motion of the position, the first P elements of a state, by an action, `[P, A]`.
+    position: Option<Vec<T>>,
     pub sizes: Sizes,
 }
 
@@ -28,6 +34,8 @@ pub struct PolicyDynamics<T> {
 pub struct Sizes {
     /// Z, the size of a state.
     pub latent: usize,
+    /// Number of elements of a state that the inner loss and the dynamics loss compare.
+    pub compared: usize,
     /// Width of the trunk's features and of the hidden layers.
     pub hidden: usize,
     /// A, the number of actions.
@@ -51,6 +59,8 @@ pub struct PolicyDynamicsGradient<T> {
     pub trunk: DenseGradient<T>,
     pub policy: [DenseGradient<T>; 2],
     pub dynamics: Option<[DenseGradient<T>; 2]>,
+    /// `[P, A]`.
+    pub position: Option<Vec<T>>,
 }
 
 /// Tape of a step: intermediates for later passes.
@@ -87,8 +97,10 @@ impl<T: Element> PolicyDynamics<T> {
             trunk: layer("trunk", 0),
             policy: POLICY.map(after_relu),
             dynamics: method.plans().then(|| DYNAMICS.map(after_relu)),
+            position: config.position_dynamics.then(|| weights.get("network.position.weight")),
             sizes: Sizes {
                 latent,
+                compared: config.compared_elements() as usize,
                 hidden,
                 actions: config.actions as usize,
                 trunk_inputs: config.trunk_inputs() as usize,
@@ -102,6 +114,7 @@ impl<T: Element> PolicyDynamics<T> {
             trunk: self.trunk.gradient(),
             policy: self.policy.each_ref().map(Dense::gradient),
             dynamics: self.dynamics.as_ref().map(|layers| layers.each_ref().map(Dense::gradient)),
+            position: self.position.as_ref().map(|weight| vec![T::ZERO; weight.len()]),
         }
     }
 
@@ -115,6 +128,7 @@ impl<T: Element> PolicyDynamics<T> {
         for (name, (layer, gradient)) in DYNAMICS.iter().zip(dynamics) {
             weights.extend(layer.in_weights(name, gradient));
         }
+        weights.extend(gradient.position.iter().map(|gradient| ("position.weight".to_owned(), gradient.clone())));
         weights
     }
 
@@ -132,7 +146,7 @@ impl<T: Element> PolicyDynamics<T> {
 
     /// Buffers for blocks of up to R = `rows` samples.
     pub fn buffers(&self, rows: usize) -> Buffers<T> {
-        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs, .. } = self.sizes;
         Buffers {
             gates: Scratch::new(),
             wide: zeros(rows * trunk_inputs.max(hidden + actions)),
@@ -184,7 +198,67 @@ impl<T: Element> PolicyDynamics<T> {
         relu(second.x(rows));
         let change = &mut buffers.narrow[..rows * latent];
         layers[1].forward(rows, second, change);
+        self.move_position(rows, action, change);
         add(x, change);
+    }
+
+    /// Replaces the changes of the positions, the first P of a state's, in `change`, `[R, Z]`, by those of an action, `[R, A]`.
+    fn move_position(&self, rows: usize, action: &[T], change: &mut [T]) {
+        let Some(weight) = &self.position else { return };
+        let Sizes { latent, actions, .. } = self.sizes;
+        for r in 0..rows {
+            let action = &action[r * actions..][..actions];
+            for (change, weight) in change[r * latent..].iter_mut().zip(weight.chunks_exact(actions)) {
+                *change = weight.iter().zip(action).map(|(weight, action)| *weight * *action).sum();
+            }
+        }
+    }
+
+    /// Adds to the gradient in an action, `[R, A]`, that by way of the positions in the next state, whose gradient is `x_bar`,
+    /// `[R, Z]`.
+    fn position_vjp(&self, rows: usize, x_bar: &[T], action_bar: &mut [T]) {
+        let Some(weight) = &self.position else { return };
+        let Sizes { latent, actions, .. } = self.sizes;
+        for r in 0..rows {
+            let action_bar = &mut action_bar[r * actions..][..actions];
+            for (x_bar, weight) in x_bar[r * latent..].iter().zip(weight.chunks_exact(actions)) {
+                for (action_bar, weight) in action_bar.iter_mut().zip(weight) {
+                    *action_bar += *x_bar * *weight;
+                }
+            }
+        }
+    }
+
+    /// Adds to the gradient in the positions' motion, from R actions and the gradient in the next states, `[R, Z]`.
+    pub fn position_hat<'a>(&self, actions: impl Iterator<Item = &'a [T]>, x_hat: &[T], gradient: &mut Option<Vec<T>>) {
+        let Some(gradient) = gradient else { return };
+        for (action, x_hat) in actions.zip(x_hat.chunks_exact(self.sizes.latent)) {
+            for (x_hat, gradient) in x_hat.iter().zip(gradient.chunks_exact_mut(action.len())) {
+                for (gradient, action) in gradient.iter_mut().zip(action) {
+                    *gradient += *x_hat * *action;
+                }
+            }
+        }
+    }
+
+    /// True if actions move the positions by position dynamics.
+    pub fn has_position_dynamics(&self) -> bool {
+        self.position.is_some()
+    }
+
+    /// Moves the positions in the states x, `[R, Z]`, by an action, `[R, A]`, and leaves the other elements as they are.
+    pub fn next_position(&self, rows: usize, action: &[T], x: &mut [T], buffers: &mut Buffers<T>) {
+        let change = &mut buffers.narrow[..rows * self.sizes.latent];
+        change.fill(T::ZERO);
+        self.move_position(rows, action, change);
+        add(x, change);
+    }
+
+    /// Sets the positions' elements of a state's gradient, `[R, Z]`, to zero: none of the dynamics branch's outputs moves them.
+    fn without_position(&self, x_bar: &mut [T]) {
+        if self.position.is_some() {
+            x_bar.chunks_exact_mut(self.sizes.latent).for_each(|x_bar| x_bar[..POSITION].fill(T::ZERO));
+        }
     }
 
     /// The gradient in state and action: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless `is_first`, and writes ā,
@@ -199,10 +273,11 @@ impl<T: Element> PolicyDynamics<T> {
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
-        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs, .. } = self.sizes;
 
         // Backward through the dynamics branch, to features and action.
         second.y_bar(rows).copy_from_slice(x_bar);
+        self.without_position(second.y_bar(rows));
         first.y_bar(rows).fill(T::ZERO);
         layers[1].vjp(rows, second, &mut buffers.gates, first.y_bar(rows));
         relu_mask(first.y_bar(rows), second.x(rows));
@@ -214,6 +289,7 @@ impl<T: Element> PolicyDynamics<T> {
             features_bar[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
             action_bar[r * actions..][..actions].copy_from_slice(&row[hidden..]);
         }
+        self.position_vjp(rows, x_bar, action_bar);
         if is_first {
             return;
         }
@@ -239,7 +315,7 @@ impl<T: Element> PolicyDynamics<T> {
         buffers: &mut Buffers<T>,
     ) {
         let Some((layers, [first, second])) = self.dynamics.as_ref().zip(step.dynamics.as_mut()) else { return };
-        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs, .. } = self.sizes;
 
         // The trunk.
         let features_dot = &mut buffers.narrow[..rows * hidden];
@@ -266,11 +342,12 @@ impl<T: Element> PolicyDynamics<T> {
         second.x_dot(rows).copy_from_slice(hidden_dot);
         let change = &mut buffers.narrow[..rows * latent];
         layers[1].jvp(rows, second, change);
+        self.move_position(rows, action_dot, change);
         add(x_dot, change);
     }
 
     /// The gradient of Φ: replaces x̂ after the step, `[R, Z]`, by x̂ before it, and adds to x̂_g, to â, `[R, A]`, and to the
-    /// weights' gradient.
+    /// weights' gradient. The pass through position dynamics is of the first order.
     pub fn double_backward(
         &self,
         rows: usize,
@@ -280,7 +357,7 @@ impl<T: Element> PolicyDynamics<T> {
         gradient: &mut PolicyDynamicsGradient<T>,
         buffers: &mut Buffers<T>,
     ) {
-        let Sizes { latent, hidden, actions, trunk_inputs } = self.sizes;
+        let Sizes { latent, hidden, actions, trunk_inputs, .. } = self.sizes;
         let features_hat = &mut buffers.narrow[..rows * hidden];
         features_hat.fill(T::ZERO);
         let gates = &mut buffers.gates;
@@ -290,6 +367,7 @@ impl<T: Element> PolicyDynamics<T> {
             (branches.dynamics, &self.dynamics, &mut step.dynamics, &mut gradient.dynamics)
         {
             second.y_hat(rows).copy_from_slice(hat.x);
+            self.without_position(second.y_hat(rows));
             first.y_hat(rows).fill(T::ZERO);
             layers[1].double_backward(rows, order, second, gates, first.y_hat(rows), &mut gradients[1]);
             relu_mask(first.y_hat(rows), second.x(rows));
@@ -300,6 +378,9 @@ impl<T: Element> PolicyDynamics<T> {
                 features_hat[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
                 add(&mut hat.action[r * actions..][..actions], &row[hidden..]);
             }
+            self.position_vjp(rows, hat.x, hat.action);
+            let inputs = first.x(rows).chunks_exact(hidden + actions);
+            self.position_hat(inputs.map(|input| &input[hidden..]), hat.x, &mut gradient.position);
         }
 
         // Backward through the policy branch, to the features.
@@ -343,6 +424,9 @@ impl<T: Element> PolicyDynamicsGradient<T> {
         let ours = [&mut self.trunk].into_iter().chain(&mut self.policy).chain(self.dynamics.iter_mut().flatten());
         let others = [&other.trunk].into_iter().chain(&other.policy).chain(other.dynamics.iter().flatten());
         ours.zip(others).for_each(|(ours, other)| ours.add(other));
+        for (ours, other) in self.position.iter_mut().zip(&other.position) {
+            add(ours, other);
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Rollout of g_θ in the inner loop, with the inner loss and its gradient in the actions.
 
-use crate::engine::networks::policy_dynamics::{Buffers, Context, PolicyDynamics, StepTape};
+use crate::engine::networks::policy_dynamics::{Buffers, Context, PolicyDynamics, Sizes, StepTape};
 use crate::engine::simd::element::Element;
 use crate::search::block::{Actions, Purpose};
 
@@ -9,7 +9,7 @@ use crate::search::block::{Actions, Purpose};
 pub struct Rollout<T> {
     /// Tapes of the H steps.
     pub steps: Vec<StepTape<T>>,
-    /// Goal error x_H - x_g, `[R, Z]`.
+    /// Goal error x_H - x_g, `[R, Z]`; 0 in elements that are not compared.
     pub goal_error: Vec<T>,
     /// Gradient of the inner loss in the actions, `[H, R, A]`.
     pub gradient: Vec<T>,
@@ -50,8 +50,12 @@ impl<T: Element> Rollout<T> {
             }
         }
 
-        for (error, (x, x_g)) in self.goal_error.iter_mut().zip(x.iter().zip(context.x_g)) {
-            *error = *x - *x_g;
+        let Sizes { latent, compared, .. } = network.sizes;
+        let states = x.chunks_exact(latent).zip(context.x_g.chunks_exact(latent));
+        for (error, (x, x_g)) in self.goal_error.chunks_exact_mut(latent).zip(states) {
+            for (error, (x, x_g)) in error[..compared].iter_mut().zip(x.iter().zip(x_g)) {
+                *error = *x - *x_g;
+            }
         }
     }
 

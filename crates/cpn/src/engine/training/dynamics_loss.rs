@@ -4,7 +4,7 @@
 use super::samples::Samples;
 use crate::engine::layers::passes::Order;
 use crate::engine::networks::policy_dynamics::{
-    Branches, Buffers, Context, Cotangents, PolicyDynamics, PolicyDynamicsGradient, StepTape,
+    Branches, Buffers, Context, Cotangents, PolicyDynamics, PolicyDynamicsGradient, Sizes, StepTape,
 };
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
@@ -17,7 +17,7 @@ pub struct DynamicsLoss<T> {
     buffers: Buffers<T>,
     /// Applied actions of a step, then their gradient, which is not used, `[R, A]`.
     action: Vec<T>,
-    /// Gradients of the loss in the predicted states, `[H, R, Z]`.
+    /// Gradients of the loss in the predicted states, `[H, R, Z]`; 0 in elements that are not compared.
     state_hat: Vec<T>,
     /// x along the rollout, then x̂, `[R, Z]`.
     x: Vec<T>,
@@ -46,23 +46,28 @@ impl<T: Element> DynamicsLoss<T> {
         (x_hat, x_g_hat): (&mut [T], &mut [T]),
         gradient: &mut PolicyDynamicsGradient<T>,
     ) -> T {
-        let (horizon, latent) = (self.steps.len(), network.sizes.latent);
+        let (horizon, Sizes { latent, compared, actions, .. }) = (self.steps.len(), network.sizes);
         let rows = samples.rows(latent);
+        let applied = |t: usize, r: usize| &samples.applied_actions[(r * horizon + t) * actions..][..actions];
         let Self { steps, buffers, action, state_hat, x } = self;
-        let (x, action) = (&mut x[..rows * latent], &mut action[..rows * network.sizes.actions]);
+        let (x, action) = (&mut x[..rows * latent], &mut action[..rows * actions]);
         let context = Context { x_g: samples.x_g, steps_left: samples.steps_left };
 
         x.copy_from_slice(samples.x);
         let mut loss = T::ZERO;
         for (t, (step, hat)) in steps.iter_mut().zip(state_hat.chunks_mut(rows * latent)).enumerate() {
-            for (r, action) in action.chunks_exact_mut(network.sizes.actions).enumerate() {
-                action.copy_from_slice(&samples.applied_actions[(r * horizon + t) * action.len()..][..action.len()]);
+            for (r, action) in action.chunks_exact_mut(actions).enumerate() {
+                action.copy_from_slice(applied(t, r));
             }
-            network.features(rows, step, x, context);
-            network.next(rows, step, action, x, buffers);
+            if network.has_position_dynamics() {
+                network.next_position(rows, action, x, buffers);
+            } else {
+                network.features(rows, step, x, context);
+                network.next(rows, step, action, x, buffers);
+            }
             for r in 0..rows {
                 let scale = samples.mask[r * horizon + t] * scale;
-                let target = &samples.next[(r * horizon + t) * latent..][..latent];
+                let target = &samples.next[(r * horizon + t) * latent..][..compared];
                 for (i, target) in target.iter().enumerate() {
                     let error = x[r * latent + i] - *target;
                     loss += scale * error * error;
@@ -73,10 +78,14 @@ impl<T: Element> DynamicsLoss<T> {
 
         x.fill(T::ZERO);
         let branches = Branches { trunk: Order::First, dynamics: Some(Order::First), policy: false };
-        for (step, state_hat) in steps.iter_mut().zip(state_hat.chunks(rows * latent)).rev() {
+        for (t, (step, state_hat)) in steps.iter_mut().zip(state_hat.chunks(rows * latent)).enumerate().rev() {
             add(x, state_hat);
-            let mut hat = Cotangents { x, x_g: x_g_hat, action };
-            network.double_backward(rows, branches, step, &mut hat, gradient, buffers);
+            if network.has_position_dynamics() {
+                network.position_hat((0..rows).map(|r| applied(t, r)), x, &mut gradient.position);
+            } else {
+                let mut hat = Cotangents { x, x_g: x_g_hat, action };
+                network.double_backward(rows, branches, step, &mut hat, gradient, buffers);
+            }
         }
         add(x_hat, x);
         loss

@@ -62,7 +62,7 @@ struct Settings<T> {
     cloning: T,
     /// True if the plans before the last update are cloned, too.
     every_update: bool,
-    /// Weight of a squared error of a predicted state's element: that of the loss / (Z Σ mask).
+    /// Weight of a squared error of a predicted state's element: that of the loss over their number, compared × Σ mask.
     dynamics: T,
 }
 
@@ -107,7 +107,7 @@ impl<T: Element> OuterLoop<T> {
     /// The outer loss of a batch and its gradient, deterministic for a given number of threads.
     pub fn run(&mut self, weights: &impl Weights<T>, samples: Samples<'_, T>) -> OuterGradient<T> {
         let network = PolicyDynamics::new(&self.config, weights);
-        let (horizon, updates) = (self.config.horizon as usize, self.config.updates as usize);
+        let (horizon, updates) = (self.config.horizon as usize, self.config.trained_updates() as usize);
         let count: T = samples.mask.iter().copied().sum();
         let cloned_plans = if self.losses.every_update { updates + 1 } else { 1 };
         let settings = Settings {
@@ -116,7 +116,7 @@ impl<T: Element> OuterLoop<T> {
             step_size: weights.get("step_size")[0],
             cloning: T::ONE / (count * T::count(network.sizes.actions) * T::count(cloned_plans)),
             every_update: self.losses.every_update,
-            dynamics: T::from_f64(self.losses.dynamics) / (count * T::count(network.sizes.latent)),
+            dynamics: T::from_f64(self.losses.dynamics) / (count * T::count(network.sizes.compared)),
         };
 
         // Each thread computes its share of the samples in blocks.
