@@ -89,7 +89,7 @@ build: setup ## Compile the services, optimised, into target/release
 	cargo build --release --locked
 
 # Compiled as for `test`, so that a new machine compiles every crate once for both.
-demo: setup ## Show CPN, TE-BC and random three tasks each, and report who solves them at the first attempt
+demo: setup ## Show CPN, with position dynamics and without, TE-BC and random three tasks each, and report who solves them at the first attempt
 	cargo build --workspace --locked
 	CPN_PROGRAMS=$(CURDIR)/target/debug $(WORKER)/bin/python experiments/demo.py
 

@@ -1,4 +1,4 @@
-"""The shipped checkpoints from nothing: demonstrations of all 24 tasks, then a training run for each learned method.
+"""The shipped checkpoints from nothing: demonstrations of all 24 tasks, then a training run for each.
 
 An interrupted run resumes.
 """
@@ -8,8 +8,9 @@ from lab import ROOT, Lab, main, on_every_core, train
 
 # The four tasks that the paper names are never trained on; see docs/decisions/0004-demonstration-tasks.md.
 HELD_OUT = "door-lock,drawer-close,dial-turn,coffee-button"
-METHODS = ("cpn", "upn", "te-bc", "bc")
-# The paper's networks, all trained as the preset cpn is.
+PRESETS = {"cpn": "paper-cpn", "upn": "paper-upn", "te-bc": "paper-te-bc", "bc": "paper-bc", "cpn-position": "cpn-position"}
+"""Presets of the checkpoints."""
+# All trained as the preset cpn is.
 SETTINGS = ("training.epochs=5", "training.samples_per_draw=8", "training.precision=bfloat16")
 
 
@@ -20,8 +21,8 @@ def models() -> None:
     options += [option for setting in SETTINGS for option in ("--set", setting)]
     with Lab(ROOT / "runs/models") as lab:
         on_every_core(
-            lambda method: train(lab, ROOT / f"models/{method}.safetensors", "--preset", f"paper-{method}", *options),
-            METHODS,
+            lambda name: train(lab, ROOT / f"models/{name}.safetensors", "--preset", PRESETS[name], *options),
+            PRESETS,
         )
 
 
