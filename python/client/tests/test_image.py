@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.ExifTags
 import PIL.Image
 import pytest
 from conftest import FRAME
@@ -88,6 +89,13 @@ def test_without_pillow_arrays_work_and_the_extra_is_named(
     for source in (FRAME, np.zeros((85, 84, 3), np.uint8)):
         with pytest.raises(ImportError, match=r"pip install 'cpn-client\[image\]'"):
             Image.of(source)
+
+
+def test_picture_of_a_phone_is_turned_upright(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
+    exif = PIL.Image.Exif()
+    exif[PIL.ExifTags.Base.Orientation] = 6  # Stored a quarter turn to the left.
+    PIL.Image.fromarray(np.rot90(pixels)).save(tmp_path / "goal.png", exif=exif)
+    assert Image.of(tmp_path / "goal.png").data == pixels.tobytes()
 
 
 def test_missing_file_is_pillows_error(tmp_path: Path) -> None:

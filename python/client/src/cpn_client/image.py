@@ -53,7 +53,7 @@ class Image:
     def of(cls, source: ImageLike, resize: Resize = "pad", field: str = "image") -> Image:
         """Image from an array or buffer, uint8 [height, width, 3], from 84 * 84 * 3 bytes, a file or a Pillow image.
 
-        Another size than 84 x 84 is scaled with its aspect ratio kept: `"pad"` adds black bars to the shorter side,
+        A file is turned upright as its EXIF orientation says. Another size than 84 x 84 is scaled with its aspect ratio kept: `"pad"` adds black bars to the shorter side,
         `"crop"` cuts the longer one at both ends. Checkpoints are trained on square images, without bars.
 
         Args:
@@ -74,7 +74,7 @@ class Image:
             return cls(bytes(source))
         if isinstance(source, (str, os.PathLike)):
             with _pillow().open(source) as file:
-                return cls(_scaled(file, resize))
+                return cls(_scaled(_upright(file), resize))
         if hasattr(source, "convert"):
             return cls(_scaled(source, resize))
         height, width, data = _pixels(source, field)
@@ -132,6 +132,13 @@ def _pillow() -> Any:  # noqa: ANN401
             "pip install 'cpn-client[image]'"
         ) from None
     return PIL.Image
+
+
+def _upright(image: Any) -> Any:  # noqa: ANN401
+    """Pillow image turned as its EXIF orientation says: phones store pictures as the sensor saw them."""
+    from PIL import ImageOps
+
+    return ImageOps.exif_transpose(image)
 
 
 def _scaled(image: Any, resize: Resize) -> bytes:  # noqa: ANN401
