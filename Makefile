@@ -89,7 +89,7 @@ build: setup ## Compile the services, optimised, into target/release
 	cargo build --release --locked
 
 # Compiled as for `test`, so that a new machine compiles every crate once for both.
-demo: setup ## Show CPN, with position dynamics and without, TE-BC and random three tasks each, and report who solves them at the first attempt
+demo: setup ## Evaluate CPN, with position dynamics and without, TE-BC and random on three tasks each, and report first-attempt success
 	cargo build --workspace --locked
 	CPN_PROGRAMS=$(CURDIR)/target/debug $(WORKER)/bin/python experiments/demo.py
 
@@ -110,7 +110,7 @@ experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the exp
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
 	done
 
-ablations: build ## Train with other losses and dynamics, two seeds each, and evaluate on tasks left out, six at once (GROUPS="reported-1 reported-2 reported-3"); goes on where it was interrupted
+ablations: build ## Train with other losses and dynamics, two seeds each, and evaluate on six tasks left out of training (GROUPS="reported-1 reported-2 reported-3" for the others); goes on where it was interrupted
 	$(WORKER)/bin/python experiments/ablations.py $(if $(GROUPS),--groups $(GROUPS))
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training

@@ -21,7 +21,7 @@ RESULTS = ROOT / "docs/results/ablations"
 DEVELOPMENT = ("coffee-button", "dial-turn", "door-lock", "drawer-close", "handle-press", "handle-pull")
 """The four tasks that the paper names, and two that `random.Random(0)` drew of the 20 others, in the order of names."""
 TRAINED = ("plate-slide", "window-close")
-"""Tasks of the training demonstrations of the development tasks, on other variations."""
+"""Two tasks in training while the development tasks are left out, evaluated on other variations."""
 REPORTED = {
     "reported-1": ("assembly", "basketball", "button-press", "button-press-topdown", "coffee-pull", "disassemble"),
     "reported-2": ("door-close", "door-open", "door-unlock", "drawer-open", "faucet-close", "faucet-open"),
@@ -169,7 +169,8 @@ def development_table() -> str:
 def reported_table() -> str:
     """Successes on the reported tasks by arm and number of updates, with Wilson intervals, in Markdown.
 
-    The rows of all groups and seeds that were run.
+    Groups and training seeds are pooled, so that the intervals leave out the differences between seeds; cells that were
+    not run are missing.
     """
     arms: dict[tuple[str, str], dict[str, list[int]]] = {}
     for arm, group, seed in product(REPORTED_ARMS, REPORTED, SEEDS):
@@ -209,6 +210,9 @@ def ablations() -> None:
     )
     parser.add_argument("--seeds", nargs="+", type=int, choices=SEEDS, default=SEEDS, help="training seeds")
     arguments = parser.parse_args()
+    unreported = [arm for arm in arguments.arms or () if arm not in REPORTED_ARMS]
+    if unreported and set(arguments.groups) != {"development"}:
+        parser.error(f"--arms: expected {', '.join(REPORTED_ARMS)} for a reported group, got {', '.join(unreported)}")
     if not arguments.table:
         cells = [
             Cell(group, arm, seed)

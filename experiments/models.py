@@ -1,4 +1,4 @@
-"""The shipped checkpoints from nothing: demonstrations of all 24 tasks, then a training run for each.
+"""The shipped checkpoints from nothing: demonstrations of all 24 tasks, then a training run for each checkpoint.
 
 An interrupted run resumes.
 """
@@ -8,8 +8,14 @@ from lab import ROOT, Lab, main, on_every_core, train
 
 # The four tasks that the paper names are never trained on; see docs/decisions/0004-demonstration-tasks.md.
 HELD_OUT = "door-lock,drawer-close,dial-turn,coffee-button"
-PRESETS = {"cpn": "paper-cpn", "upn": "paper-upn", "te-bc": "paper-te-bc", "bc": "paper-bc", "cpn-position": "cpn-position"}
-"""Presets of the checkpoints."""
+PRESETS = {
+    "cpn": "paper-cpn",
+    "upn": "paper-upn",
+    "te-bc": "paper-te-bc",
+    "bc": "paper-bc",
+    "cpn-position": "cpn-position",
+}
+"""Preset of each checkpoint."""
 # All trained as the preset cpn is.
 SETTINGS = ("training.epochs=5", "training.samples_per_draw=8", "training.precision=bfloat16")
 

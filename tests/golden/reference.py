@@ -18,6 +18,7 @@ from torch.nn import functional
 Weights = dict[str, torch.Tensor]
 
 LATENT, HIDDEN, GATE, ACTIONS, HORIZON, BATCH = 8, 6, 5, 4, 3, 2
+POSITION = 3  # Elements of a state that actions move linearly, with position dynamics.
 CONVOLUTIONS = [(4, 8, 8), (6, 4, 2)]  # channels, kernel, stride
 
 
@@ -35,7 +36,7 @@ def dense_shapes(prefix: str, inputs: int, outputs: int, gated: bool) -> dict[st
     return shapes
 
 
-def make_weights(method: str) -> Weights:
+def make_weights(method: str, position_dynamics: bool) -> Weights:
     """Random weights of a small model of the method, upn or cpn."""
     gated = method == "cpn"
     shapes: dict[str, tuple[int, ...]] = {"step_size": ()}
@@ -50,6 +51,8 @@ def make_weights(method: str) -> Weights:
     shapes |= dense_shapes("network.policy_1", HIDDEN, ACTIONS, gated)
     shapes |= dense_shapes("network.dynamics_0", HIDDEN + ACTIONS, HIDDEN, gated)
     shapes |= dense_shapes("network.dynamics_1", HIDDEN, LATENT, gated)
+    if position_dynamics:
+        shapes["network.position.weight"] = (POSITION, ACTIONS)
     return {name: torch.randn(shape) * 0.3 for name, shape in shapes.items()}
 
 
@@ -92,14 +95,18 @@ def policy(w: Weights, h: torch.Tensor) -> torch.Tensor:
 def step(w: Weights, x: torch.Tensor, h: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     """Next state `[LATENT]` from a state, its features and an action."""
     hidden = dense(w, "network.dynamics_0", torch.cat([h, action])).clamp(min=0)
-    return x + dense(w, "network.dynamics_1", hidden)
+    change = dense(w, "network.dynamics_1", hidden)
+    if "network.position.weight" in w:
+        change = torch.cat([w["network.position.weight"] @ action, change[POSITION:]])
+    return x + change
 
 
 def inner_loss(actions: torch.Tensor, w: Weights, x: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-    """Huber loss between the state after the actions `[HORIZON, ACTIONS]` and the goal, summed over the latent."""
+    """Huber loss between the state after the actions `[HORIZON, ACTIONS]` and the goal, over the compared elements."""
     for action in actions:
         x = step(w, x, features(w, x, goal), action)
-    error = (x - goal).abs()
+    compared = POSITION if "network.position.weight" in w else LATENT
+    error = (x - goal)[:compared].abs()
     return torch.where(error < 1, 0.5 * error**2, error - 0.5).sum()
 
 
@@ -140,18 +147,21 @@ def outer_loss(w: Weights, batch: Batch, updates: int) -> torch.Tensor:
 
 
 def main() -> None:
-    """Writes a file for each of the two methods that plan."""
+    """Writes a file for each of the methods that plan, and one with position dynamics."""
     torch.set_default_dtype(torch.float64)
-    for method, updates in (("upn", 1), ("cpn", 2)):
+    for name, updates, position_dynamics in (("upn", 1, False), ("cpn", 2, False), ("cpn-position", 2, True)):
         torch.manual_seed(7)
-        weights = make_weights(method)
+        method = name.removesuffix("-position")
+        weights = make_weights(method, position_dynamics)
+        # With position dynamics the policy's plan is cloned.
+        trained_updates = 0 if position_dynamics else updates
         observations, goals = torch.randint(0, 256, (2, BATCH, 84, 84, 3), dtype=torch.uint8)
         demonstrated = torch.rand(BATCH, HORIZON, ACTIONS) * 2 - 1
         batch = Batch(observations, goals, demonstrated, torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]]))
 
         pairs = [(encode(weights, o), encode(weights, g)) for o, g in zip(observations, goals, strict=True)]
         plans = [plan(weights, x, goal, updates) for x, goal in pairs]
-        gradients = grad(outer_loss)(weights, batch, updates)
+        gradients = grad(outer_loss)(weights, batch, trained_updates)
         tensors = {f"weight.{k}": v for k, v in weights.items()} | {f"gradient.{k}": v for k, v in gradients.items()}
         tensors |= batch._asdict()
         tensors |= {
@@ -159,7 +169,7 @@ def main() -> None:
             "x_g": torch.stack([goal for _, goal in pairs]),
             "actions": torch.stack([actions for actions, _ in plans]),
             "inner_losses": torch.stack([losses for _, losses in plans], dim=1),
-            "outer_loss": outer_loss(weights, batch, updates),
+            "outer_loss": outer_loss(weights, batch, trained_updates),
         }
         model = {
             "method": method,
@@ -175,8 +185,10 @@ def main() -> None:
             "horizon": HORIZON,
             "updates": updates,
         }
-        tensors = {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}
-        path = Path(__file__).parent / f"{method}.safetensors"
+        if position_dynamics:
+            model["position_dynamics"] = True
+        tensors = {key: tensor.detach().clone().contiguous() for key, tensor in tensors.items()}
+        path = Path(__file__).parent / f"{name}.safetensors"
         save_file(tensors, path, metadata={"cpn": json.dumps(model)})
 
 

@@ -15,7 +15,7 @@ from openpi_client.image_tools import resize_with_pad
 from cpn.v1 import planner_pb2
 
 Pictures = tuple[NDArray[np.uint8], NDArray[np.uint8]]
-MODELS = ["bc", "cpn", "random", "te-bc", "upn"]
+MODELS = ["bc", "cpn", "cpn-position", "random", "te-bc", "upn"]
 
 
 @pytest.mark.parametrize("model", MODELS)

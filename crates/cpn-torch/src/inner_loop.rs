@@ -21,7 +21,7 @@ pub struct TensorPlan {
 pub struct InnerLoop<'a> {
     /// g_θ.
     pub network: &'a PolicyDynamics,
-    /// α, the learned step size of an update, a scalar.
+    /// α, the step size of an update, a scalar; learned, except with position dynamics.
     pub step_size: &'a Tensor,
     /// H, the planning horizon.
     pub horizon: i64,

@@ -228,7 +228,7 @@ pub struct ModelConfig {
     /// U, the number of gradient updates of a plan; 0 for methods that do not plan.
     pub updates: i64,
     /// True if the first three elements of a state are the position of the hand: an action moves them by a linear function of its
-    /// own, and the inner loss compares them alone. Such plans are not trained through their updates: the policy's is cloned.
+    /// own, and the inner loss compares them alone. Training clones the policy's plan, before any update.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub position_dynamics: bool,
 }

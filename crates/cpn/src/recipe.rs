@@ -24,7 +24,8 @@ pub struct Losses {
     /// the model's gives a policy.
     pub every_update: bool,
     /// Weight of the dynamics loss: the mean squared error between the states predicted under the applied actions, after one to
-    /// H steps, and the embeddings of the frames that followed, which get no gradient from it.
+    /// H steps, and the embeddings of the frames that followed, which get no gradient from it. With position dynamics, of their first
+    /// three elements.
     pub dynamics: f64,
     /// Weight of the position loss: the mean squared error between the first three elements of each frame's embedding and the
     /// position of the hand, standardised over the demonstrations. Only training needs positions.
@@ -219,7 +220,7 @@ impl Training {
 
 impl Recipe {
     /// Checks every value against its range. Augmentation and the position loss are allowed only with images, losses of plans only
-    /// for methods that plan. Position dynamics need the dynamics loss and, with images, the position loss.
+    /// for methods that plan. Position dynamics are allowed only with images, and need the dynamics loss and the position loss.
     ///
     /// # Errors
     /// The first field out of its range, with the range and the value.
@@ -238,11 +239,13 @@ impl Recipe {
             in_range("encoder.latent", self.model.encoder.latent(), 3, 512)?;
         }
         if self.model.position_dynamics {
+            // The embedding of a position has no element that is a coordinate.
+            if self.model.encoder.input() == Input::Position {
+                return Err(ConfigError::new("model.position_dynamics", true, "false (with positions)", false));
+            }
             let Losses { every_update, dynamics, position } = self.training.losses;
             in_range("training.losses.every_update", every_update.into(), 0, 0)?;
-            let of_images =
-                (self.model.encoder.input() == Input::Image).then_some(("training.losses.position", position));
-            for (field, weight) in [("training.losses.dynamics", dynamics)].into_iter().chain(of_images) {
+            for (field, weight) in [("training.losses.dynamics", dynamics), ("training.losses.position", position)] {
                 if weight == 0.0 {
                     return Err(ConfigError::new(field, weight, "above 0 (with position_dynamics)", 1e6));
                 }
@@ -256,5 +259,34 @@ impl Recipe {
             }
         }
         self.training.validate()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn position_dynamics_need_images_and_their_losses() {
+        let Recipe { model, training } = Preset::CpnPosition.recipe();
+        let with =
+            |losses| Recipe { model: model.clone(), training: Training { losses, ..training.clone() } }.validate();
+        let losses = training.losses;
+        assert!(with(losses).is_ok());
+        for (losses, field) in [
+            (Losses { every_update: true, ..losses }, "training.losses.every_update"),
+            (Losses { dynamics: 0.0, ..losses }, "training.losses.dynamics"),
+            (Losses { position: 0.0, ..losses }, "training.losses.position"),
+        ] {
+            assert_eq!(with(losses).map_err(|error| error.field), Err(field));
+        }
+
+        let of_positions = ModelConfig { encoder: EncoderConfig::position([0; 3], 1), ..model.clone() };
+        let plain = Losses { position: 0.0, ..losses };
+        let recipe = Recipe { model: of_positions, training: Training { losses: plain, ..training.clone() } };
+        assert_eq!(recipe.validate().map_err(|error| error.field), Err("model.position_dynamics"));
+
+        let policy = ModelConfig { position_dynamics: true, ..ModelConfig::paper(MethodKind::TeBc) };
+        assert_eq!(policy.validate().map_err(|error| error.field), Err("position_dynamics"));
     }
 }

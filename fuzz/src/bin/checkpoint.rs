@@ -42,13 +42,15 @@ fn check_file(file: &[u8]) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-/// Small checkpoints with each kind of encoder.
-static EXAMPLES: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
-    let image = EncoderConfig::Image(ImageEncoderConfig {
-        convolutions: vec![ConvConfig { channels: 1, kernel: 8, stride: 16 }],
-        latent: 2,
-        layer_norm: true,
-    });
+/// Small checkpoints with each kind of encoder, and one with position dynamics.
+static EXAMPLES: LazyLock<[Vec<u8>; 3]> = LazyLock::new(|| {
+    let image = |latent| {
+        EncoderConfig::Image(ImageEncoderConfig {
+            convolutions: vec![ConvConfig { channels: 1, kernel: 8, stride: 16 }],
+            latent,
+            layer_norm: true,
+        })
+    };
     let position = EncoderConfig::Position(PositionEncoderConfig {
         centre_mm: [500, 0, -200],
         scale_mm: 400,
@@ -56,11 +58,16 @@ static EXAMPLES: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
         latent: 2,
         layer_norm: true,
     });
-    [(MethodKind::TeBcHorizon, image), (MethodKind::Cpn, position)].map(|(method, encoder)| example(method, encoder))
+    [
+        example(MethodKind::TeBcHorizon, image(2), false),
+        example(MethodKind::Cpn, position, false),
+        example(MethodKind::Upn, image(3), true),
+    ]
 });
 
-fn example(method: MethodKind, encoder: EncoderConfig) -> Vec<u8> {
-    let config = ModelConfig { encoder, hidden: 2, gate_hidden: 1, actions: 2, ..ModelConfig::paper(method) };
+fn example(method: MethodKind, encoder: EncoderConfig, position_dynamics: bool) -> Vec<u8> {
+    let sizes = ModelConfig { hidden: 2, gate_hidden: 1, actions: 2, ..ModelConfig::paper(method) };
+    let config = ModelConfig { encoder, position_dynamics, ..sizes };
     let provenance = Provenance {
         training_tasks: vec!["reach".into()],
         data_digest: "0".repeat(64),

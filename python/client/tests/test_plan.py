@@ -73,7 +73,7 @@ def test_random_model_depends_on_the_seed_alone(planner: Planner) -> None:
 
 def test_models_are_those_of_the_folder(planner: Planner) -> None:
     models = {model.name: model for model in planner.models()}
-    assert sorted(models) == ["bc", "cpn", "random", "te-bc", "upn"]
+    assert sorted(models) == ["bc", "cpn", "cpn-position", "random", "te-bc", "upn"]
     cpn = models["cpn"]
     assert (cpn.method, cpn.horizon, len(cpn.digest), len(cpn.training_tasks)) == ("cpn", 5, 64, 20)
 

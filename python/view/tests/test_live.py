@@ -164,6 +164,10 @@ def test_plans(network: Network, shown: Shown, rrd: Path) -> None:
         {"camera": {"position": [0, 0, 0], "rotation": [1] * 8, "field_of_view_degrees": 60}},
         {"camera": {"position": [0, 0, 0], "rotation": [1] * 9, "field_of_view_degrees": 0}},
         {"camera": {"position": [0, 0, 0], "rotation": [1] * 9, "field_of_view_degrees": 60}, "hand_position": [0, 0]},
+        {
+            "camera": {"position": [0] * 3, "rotation": [1] * 9, "field_of_view_degrees": 5e-324},
+            "hand_position": [0] * 3,
+        },
         {"goal": types_pb2.Image(height=2, width=2)},
     ],
 )
@@ -174,6 +178,34 @@ def test_faulty_frame_is_dropped(
     shown(lambda: "dropped a message at cpn/@v1/sim/w0/frame: " in caplog.text)
     network.frame("w0", 1, frames(1)[0])
     shown(lambda: len(pictures(rrd, "/workers/w0/camera")) == 1)
+
+
+@pytest.mark.parametrize("lengths", [(), (3, 1), (2,)])
+def test_faulty_plan_is_dropped(
+    network: Network, shown: Shown, rrd: Path, caplog: pytest.LogCaptureFixture, lengths: tuple[int, ...]
+) -> None:
+    network.frame("w0", 0, frames(1)[0])
+    shown(lambda: pictures(rrd, "/workers/w0/camera"))
+    faulty = planner_pb2.PlanResponse(actions=[action(np.zeros(length, np.float32)) for length in lengths])
+    network.plan("w0", 0, faulty)
+    shown(lambda: "dropped a message at cpn/@v1/sim/w0/plan: " in caplog.text)
+    assert not rows(rrd, "/workers/w0/plan/times_ms")
+
+
+def test_late_plan_revives_no_worker(
+    network: Network, watcher: zenoh.Session, shown: Shown, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    token = network.alive("w0")
+    shown(lambda: "worker w0 is here" in caplog.text)
+    token.undeclare()
+    shown(lambda: "worker w0 is gone" in caplog.text)
+    with watcher.declare_subscriber("cpn/@v1/sim/w0/plan") as arrivals:
+        network.plan("w0", 0, planner_pb2.PlanResponse())
+        arrivals.recv()
+    network.frame("w1", 0, frames(1)[0])
+    shown(lambda: "worker w1 is here" in caplog.text)
+    assert caplog.text.count("worker w0 is here") == 1
 
 
 def test_slow_view_shows_the_present(network: Network, watcher: zenoh.Session, shown: Shown, rrd: Path) -> None:

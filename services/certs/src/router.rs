@@ -14,7 +14,7 @@ const LISTEN: &str = "tls/0.0.0.0:7447";
 const MAX_SESSIONS: usize = 1000;
 /// Length of a link's queue, in batches of up to 64 KiB: zenoh's maximum.
 const QUEUE_BATCHES: usize = 16;
-/// Highest rate of a worker's frames and of its actions, per second, for viewers.
+/// Highest rate of a worker's frames, of its actions and of its plans, per second, for viewers.
 const FRAMES_PER_SECOND: f64 = 200.0;
 /// Allowance for attachments beside a payload, in bytes.
 const ATTACHMENT_BYTES: usize = 1024;

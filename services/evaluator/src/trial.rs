@@ -144,7 +144,7 @@ pub(crate) async fn attempt(
     let mut actor = Actor::new(link, planner, model, &run.planning, variation.seed, &reset, start).await?;
 
     let step_key = key::sim_step(worker.name()).map_err(by_worker)?;
-    let watchers = Watchers::new(link, worker.name(), &reset.episode_id, &model.name).await.map_err(by_worker)?;
+    let watchers = Watchers::new(link, worker.name(), &reset.episode_id, &model.name).await;
     let mut hand = reset.hand_position;
     let mut frames = vec![Frame { image: reset.observation.clone(), time: Duration::ZERO }];
     let mut progress = vec![reset.progress];
@@ -152,7 +152,7 @@ pub(crate) async fn attempt(
     let mut held = vec![0.0; reset.control.action_size as usize];
     while step < reset.max_steps {
         let mut decided = actor.decide(&reset, step, &frames[frames.len() - 1].image, hand).await?;
-        if let Some(exchange) = actor.latest() {
+        if let Some((watchers, exchange)) = watchers.as_ref().zip(actor.latest()) {
             watchers.show(exchange).await;
         }
         if run.planning.real_time {
@@ -401,6 +401,7 @@ mod tests {
         let (link, _) = forgetful().await;
         let watcher = link.session.declare_subscriber(key::sim_plan("*").unwrap()).await.unwrap();
         let attempt = attempt(&link, &with("w"), &model(DIGEST), &variation("reach", 1), &default_run()).await.unwrap();
+        assert!(!attempt.recording.exchanges().is_empty());
         for Exchange { step, response, .. } in attempt.recording.exchanges() {
             let sample = watcher.try_recv().unwrap().unwrap();
             assert_eq!(sample.key_expr().as_str(), key::sim_plan("w").unwrap().as_str());

@@ -2,8 +2,9 @@
 
 use crate::link::Link;
 use recording::trial::Exchange;
+use service_kit::session::IntoAnyhow;
 use wire::trial::TrialPlan;
-use wire::{Code, Error, encode, key, query};
+use wire::{encode, key, query};
 use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 
@@ -15,18 +16,11 @@ pub(crate) struct Watchers<'a> {
 }
 
 impl<'a> Watchers<'a> {
-    /// The publisher of an episode of a worker.
-    ///
-    /// # Errors
-    /// If the worker's name is not valid in a key, or the session is closed.
-    pub(crate) async fn new(link: &'a Link, worker: &str, episode_id: &str, model: &str) -> Result<Self, Error> {
-        let declared = link.session.declare_publisher(key::sim_plan(worker)?);
-        let publisher = declared
-            .congestion_control(CongestionControl::Drop)
-            .encoding(query::encoding::<wire::proto::TrialPlan>())
-            .await
-            .map_err(|error| Error::new(Code::Unavailable, "session", "an open one", error))?;
-        Ok(Self { publisher, episode_id: episode_id.to_owned(), model: model.to_owned() })
+    /// The publisher of an episode of a worker; none if it cannot be declared, since a trial goes on without watchers.
+    pub(crate) async fn new(link: &'a Link, worker: &str, episode_id: &str, model: &str) -> Option<Self> {
+        let publisher =
+            declare(link, worker).await.inspect_err(|error| tracing::debug!("plans are not published: {error}"));
+        Some(Self { publisher: publisher.ok()?, episode_id: episode_id.to_owned(), model: model.to_owned() })
     }
 
     /// Publishes a plan.
@@ -37,4 +31,9 @@ impl<'a> Watchers<'a> {
             tracing::debug!("a plan was not published: {error}");
         }
     }
+}
+
+async fn declare<'a>(link: &'a Link, worker: &str) -> anyhow::Result<Publisher<'a>> {
+    let declared = link.session.declare_publisher(key::sim_plan(worker)?).congestion_control(CongestionControl::Drop);
+    declared.encoding(query::encoding::<wire::proto::TrialPlan>()).await.into_anyhow()
 }

@@ -114,7 +114,7 @@ fn position_dynamics_agree_with_autograd() {
     for (method, dynamics) in [(MethodKind::Upn, 0.7), (MethodKind::Cpn, 0.7), (MethodKind::Cpn, 0.0)] {
         for (horizon, updates) in [(1, 1), (5, 2)] {
             let config = ModelConfig { horizon, updates, position_dynamics: true, ..small_config(method) };
-            for (rows, threads) in [(1, 1), (70, 3)] {
+            for (rows, threads) in [(1, 1), (70, 1), (70, 3)] {
                 check(config.clone(), Losses { dynamics, ..Losses::default() }, rows, threads);
             }
         }

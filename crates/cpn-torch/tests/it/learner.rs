@@ -22,7 +22,9 @@ fn engines() -> Vec<Box<dyn Engine>> {
 }
 
 fn configs() -> impl Iterator<Item = ModelConfig> {
-    MethodKind::ALL.into_iter().flat_map(|method| [small_config(method), position_config(method)])
+    let position_dynamics = ModelConfig { position_dynamics: true, ..small_config(MethodKind::Cpn) };
+    let configs = MethodKind::ALL.into_iter().flat_map(|method| [small_config(method), position_config(method)]);
+    configs.chain([position_dynamics])
 }
 
 /// Six samples of four frames.
@@ -52,7 +54,8 @@ fn batch(config: &ModelConfig, seed: u64) -> Batch {
 /// Settings with all losses that the model has.
 fn training(config: &ModelConfig) -> Training {
     let plans = config.method.plans();
-    let losses = Losses { every_update: plans, dynamics: if plans { 0.5 } else { 0.0 }, position: 0.2 };
+    let every_update = plans && !config.position_dynamics;
+    let losses = Losses { every_update, dynamics: if plans { 0.5 } else { 0.0 }, position: 0.2 };
     Training { max_gradient_norm: 1.0, losses, ..Training::paper() }
 }
 

@@ -45,18 +45,7 @@ fn planner() -> Vec<Example> {
             steps_left: Some(70),
             ..plan(Goal::Id(digest()), image().into())
         }),
-        example(PlanResponse {
-            actions: vec![action(); 2],
-            first_action: action(),
-            inner_losses: vec![0.5, 0.25],
-            latent_distance: Some(1.5),
-            times: StageTimes { queue_seconds: 0.1, encode_seconds: 0.2, plan_seconds: 0.3 },
-            model_digest: digest(),
-            goal_id: digest(),
-            iterations: 1,
-            iterations_run: 2,
-            warm_start: vec![action(); 2],
-        }),
+        example(plan_response()),
         example(RegisterGoalRequest { image: image() }),
         example(RegisterGoalResponse { goal_id: digest() }),
         example(LoadModelRequest { model: "cpn".into(), source: CheckpointSource::File("cpn.safetensors".into()) }),
@@ -75,7 +64,23 @@ fn planner() -> Vec<Example> {
             steps: 3,
             plans: 2,
         }),
+        example(TrialPlan { episode_id: "reach-5".into(), step: 3, model: "cpn".into(), plan: plan_response() }),
     ]
+}
+
+fn plan_response() -> PlanResponse {
+    PlanResponse {
+        actions: vec![action(); 2],
+        first_action: action(),
+        inner_losses: vec![0.5, 0.25],
+        latent_distance: Some(1.5),
+        times: StageTimes { queue_seconds: 0.1, encode_seconds: 0.2, plan_seconds: 0.3 },
+        model_digest: digest(),
+        goal_id: digest(),
+        iterations: 1,
+        iterations_run: 2,
+        warm_start: vec![action(); 2],
+    }
 }
 
 fn simulator() -> Vec<Example> {

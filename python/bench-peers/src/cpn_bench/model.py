@@ -31,7 +31,13 @@ class ModelConfig:
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "ModelConfig":
-        """Reads the JSON document of `ModelConfig` in `crates/cpn/src/config.rs`."""
+        """Reads the JSON document of `ModelConfig` in `crates/cpn/src/config.rs`.
+
+        Raises:
+            ValueError: If it has position dynamics, which the peers do not compute.
+        """
+        if document.get("position_dynamics"):
+            raise ValueError("position_dynamics: expected false, which alone the peers compute, got true")
         encoder = document["encoder"]
         return cls(
             method=document["method"],

@@ -53,8 +53,9 @@ class Image:
     def of(cls, source: ImageLike, resize: Resize = "pad", field: str = "image") -> Image:
         """Image from an array or buffer, uint8 [height, width, 3], from 84 * 84 * 3 bytes, a file or a Pillow image.
 
-        A file is turned upright as its EXIF orientation says. Another size than 84 x 84 is scaled with its aspect ratio kept: `"pad"` adds black bars to the shorter side,
-        `"crop"` cuts the longer one at both ends. Checkpoints are trained on square images, without bars.
+        A file is turned upright by its EXIF orientation, a Pillow image is not. Another size than 84 x 84 is scaled
+        with its aspect ratio kept: `"pad"` adds black bars to the shorter side, `"crop"` cuts the longer one at both
+        ends. Checkpoints are trained on square images, without bars.
 
         Args:
             source: Image.

@@ -59,8 +59,8 @@ class Plan:
     first_action: Action
     """[A], action to apply now: the first, clipped to [-1, 1]."""
     inner_losses: tuple[float, ...]
-    """[iterations_run + 1], Huber distance to the goal's embedding before and after each iteration; empty for methods
-    that do not plan."""
+    """[iterations_run + 1], Huber distance to the goal's embedding, with position dynamics to its first three elements,
+    before and after each iteration; empty for methods that do not plan."""
     latent_distance: float | None
     """Euclidean distance between the observation's and the goal's embedding; None for the random method."""
     times: StageTimes

@@ -89,15 +89,19 @@ class LiveView:
     def _take(self, subscriber: Subscriber, message_type: type[M], take: Callable[[Worker, M], None]) -> None:
         """Hands the messages that wait to their workers; faulty ones are dropped."""
         for sample in _waiting(subscriber):
+            name = str(sample.key_expr).split("/")[-2]
+            # Plans come from the evaluator, also after the worker's token has gone.
+            if subscriber is self._plans and name not in self._workers:
+                continue
             try:
                 message = message_type()
                 message.ParseFromString(sample.payload.to_bytes())
-                take(self._worker(str(sample.key_expr).split("/")[-2]), message)
+                take(self._worker(name), message)
             except (DecodeError, ValueError) as error:
                 log.warning("dropped a message at %s: %s", sample.key_expr, error)
 
     def _worker(self, name: str) -> Worker:
-        """The worker of a name, which is new here or not."""
+        """Worker of a name, added if it is new."""
         if name not in self._workers:
             log.info("worker %s is here", name)
             self._workers[name] = Worker(self._stream, name)

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from cpn.v1 import sim_pb2, trial_pb2
 from cpn_view import panels
 
-MAX_DEGREES = 180
+MIN_DEGREES, MAX_DEGREES = 0.1, 179.9
+"""Range of a camera's field of view."""
+MAX_HANDS = 64
+"""Number of steps, the newest of the episode, whose plans can be drawn."""
 
 
 def entity(worker: str, *names: str) -> str:
@@ -19,7 +22,7 @@ def entity(worker: str, *names: str) -> str:
 
 
 class Worker:
-    """A worker's episode, and the share of its episodes that were solved."""
+    """Entities of a worker: its episode, and the number of its episodes that were solved."""
 
     def __init__(self, stream: rr.RecordingStream, name: str) -> None:
         self._stream = stream
@@ -28,8 +31,9 @@ class Worker:
         self._drawn = True
         self._acting = ""
         """Id of the episode of the last action."""
-        self._solved: set[str] = set()
-        self._episodes = 0
+        self._episodes, self._solved = 0, 0
+        self._hands: dict[int, list[float]] = {}
+        """Positions of the hand in the episode, by step."""
 
     def frame(self, frame: sim_pb2.Frame) -> None:
         """Takes a frame, which `draw` shows unless a later one comes before.
@@ -38,11 +42,16 @@ class Worker:
             ValueError: If a field is malformed.
         """
         _check(frame)
-        if self._frame is None or frame.episode_id != self._frame.episode_id:
+        starts = self._frame is None or frame.episode_id != self._frame.episode_id
+        was_solved = not starts and self._frame is not None and self._frame.success
+        if starts:
             self._start(frame)
+        self._solved += frame.success and not was_solved
         self._frame, self._drawn = frame, False
-        if frame.success:
-            self._solved.add(frame.episode_id)
+        if frame.HasField("camera"):
+            self._hands[frame.step] = list(frame.hand_position)
+            if len(self._hands) > MAX_HANDS:
+                del self._hands[next(iter(self._hands))]
 
     def action(self, message: sim_pb2.AppliedAction) -> None:
         """Shows an applied action."""
@@ -58,13 +67,14 @@ class Worker:
         Raises:
             ValueError: If the actions differ in length, or have less than three values.
         """
+        actions = np.array([action.values for action in message.plan.actions])
+        if actions.ndim != 2 or actions.shape[1] < 3:
+            raise ValueError(f"plan.actions: expected [H, A] with A at least 3, got {actions.shape}")
         panels.plan(self._stream, entity(self._name, "plan"), message.plan)
-        frame = self._frame
-        if frame and frame.HasField("camera") and frame.episode_id == message.episode_id:
-            actions = np.array([action.values for action in message.plan.actions])
-            if actions.ndim != 2 or actions.shape[1] < 3:
-                raise ValueError(f"plan.actions: expected [H, A] with A at least 3, got {actions.shape}")
-            path = planned_positions(frame, actions)
+
+        frame, hand = self._frame, self._hands.get(message.step)
+        if frame and hand and frame.episode_id == message.episode_id:
+            path = planned_positions(hand, frame.control.metres, actions)
             self._log("path", rr.LineStrips3D([path], radii=rr.Radius.ui_points(1.5), colors=panels.GREEN))
 
     def draw(self) -> None:
@@ -78,7 +88,7 @@ class Worker:
         lines = [
             f"{frame.episode_id}, step {frame.step}",
             "solved" if frame.success else f"progress {frame.progress:.2f}",
-            f"{len(self._solved)} of {self._episodes} episodes solved so far",
+            f"{self._solved} of {self._episodes} episodes solved so far",
         ]
         self._log("episode", rr.TextDocument("\n".join(lines)))
 
@@ -88,9 +98,10 @@ class Worker:
 
     def _start(self, frame: sim_pb2.Frame) -> None:
         """Starts an episode: its goal, and the camera's pose, which places positions in the image."""
-        if frame.HasField("goal"):
-            self._log("goal", panels.image_of(frame.goal))
+        self._log("goal", panels.image_of(frame.goal) if frame.HasField("goal") else rr.Clear(recursive=False))
+        self._log("camera", rr.Clear(recursive=False))
         self._episodes += 1
+        self._hands.clear()
         self._log("path", rr.Clear(recursive=False))
         self._log("progress", rr.Clear(recursive=False))
         if not frame.HasField("camera"):
@@ -106,15 +117,16 @@ class Worker:
         self._stream.log(entity(self._name, name), contents)
 
 
-def planned_positions(frame: sim_pb2.Frame, actions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions of the hand's set point under planned actions, [1 + H, 3] in metres, from the position in the frame on.
+def planned_positions(hand: list[float], metres: float, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions of the hand's set point under planned actions, [1 + H, 3] in metres.
 
     Args:
-        frame: Frame with the hand's position and the control.
+        hand: Position of the hand before the first action, [3] in metres.
+        metres: Displacement of the set point by an action of 1, in metres.
         actions: [H, A], clipped to [-1, 1].
     """
-    steps = frame.control.metres * np.clip(actions[:, :3], -1, 1)
-    return np.array(frame.hand_position) + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    steps = metres * np.clip(actions[:, :3], -1, 1)
+    return np.array(hand) + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _check(frame: sim_pb2.Frame) -> None:
@@ -125,9 +137,9 @@ def _check(frame: sim_pb2.Frame) -> None:
         _check_length("camera.position", frame.camera.position, 3)
         _check_length("camera.rotation", frame.camera.rotation, 9)
         _check_length("hand_position", frame.hand_position, 3)
-        if not 0 < frame.camera.field_of_view_degrees < MAX_DEGREES:
+        if not MIN_DEGREES <= frame.camera.field_of_view_degrees <= MAX_DEGREES:
             got = frame.camera.field_of_view_degrees
-            raise ValueError(f"camera.field_of_view_degrees: expected above 0 and below {MAX_DEGREES}, got {got}")
+            raise ValueError(f"camera.field_of_view_degrees: expected {MIN_DEGREES} to {MAX_DEGREES}, got {got}")
 
 
 def _check_length(field: str, values: Sized, expected: int) -> None:

@@ -202,7 +202,7 @@ impl<T: Element> PolicyDynamics<T> {
         add(x, change);
     }
 
-    /// Replaces the changes of the positions, the first P of a state's, in `change`, `[R, Z]`, by those of an action, `[R, A]`.
+    /// Overwrites the first P elements of each change of state, `[R, Z]`, with the motion by an action, `[R, A]`.
     fn move_position(&self, rows: usize, action: &[T], change: &mut [T]) {
         let Some(weight) = &self.position else { return };
         let Sizes { latent, actions, .. } = self.sizes;
@@ -214,8 +214,7 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// Adds to the gradient in an action, `[R, A]`, that by way of the positions in the next state, whose gradient is `x_bar`,
-    /// `[R, Z]`.
+    /// Adds the gradient through position dynamics, from x̄ of the next state, `[R, Z]`, to ā, `[R, A]`.
     fn position_vjp(&self, rows: usize, x_bar: &[T], action_bar: &mut [T]) {
         let Some(weight) = &self.position else { return };
         let Sizes { latent, actions, .. } = self.sizes;
@@ -229,7 +228,7 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// Adds to the gradient in the positions' motion, from R actions and the gradient in the next states, `[R, Z]`.
+    /// Adds to the gradient of the position's weight, `[P, A]`, from R actions, `[A]` each, and x̂ of the next state, `[R, Z]`.
     pub fn position_hat<'a>(&self, actions: impl Iterator<Item = &'a [T]>, x_hat: &[T], gradient: &mut Option<Vec<T>>) {
         let Some(gradient) = gradient else { return };
         for (action, x_hat) in actions.zip(x_hat.chunks_exact(self.sizes.latent)) {
@@ -254,7 +253,7 @@ impl<T: Element> PolicyDynamics<T> {
         add(x, change);
     }
 
-    /// Sets the positions' elements of a state's gradient, `[R, Z]`, to zero: none of the dynamics branch's outputs moves them.
+    /// Zeroes the first P elements of each gradient, `[R, Z]`: the dynamics branch does not affect them.
     fn without_position(&self, x_bar: &mut [T]) {
         if self.position.is_some() {
             x_bar.chunks_exact_mut(self.sizes.latent).for_each(|x_bar| x_bar[..POSITION].fill(T::ZERO));

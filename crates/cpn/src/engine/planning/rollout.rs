@@ -59,8 +59,8 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// The gradient of the Huber loss (δ = 1) between x_H and x_g in the actions, written to [`Self::gradient`]. `x_bar`, `[R, Z]`,
-    /// is a buffer for the gradients in the states.
+    /// The gradient of the Huber loss (δ = 1) between the compared elements of x_H and x_g in the actions, written to
+    /// [`Self::gradient`]. `x_bar`, `[R, Z]`, is a buffer for the gradients in the states.
     pub fn vjp(&mut self, network: &PolicyDynamics<T>, x_bar: &mut [T], buffers: &mut Buffers<T>) {
         let rows = x_bar.len() / network.sizes.latent;
         for (x_bar, error) in x_bar.iter_mut().zip(&self.goal_error) {
@@ -73,7 +73,7 @@ impl<T: Element> Rollout<T> {
         }
     }
 
-    /// Inner losses, `[R]`, summed over the latent.
+    /// Inner losses, `[R]`, summed over the compared elements.
     pub fn losses(&self, network: &PolicyDynamics<T>, rows: usize) -> impl Iterator<Item = T> {
         self.goal_error.chunks_exact(network.sizes.latent).take(rows).map(huber_loss)
     }
