@@ -56,7 +56,7 @@ def test_a_wrong_request_raises_and_the_next_is_answered(planner: Planner, pictu
     policy = planner.connect()
     large = resize_with_pad(frame, 224, 224)
     for change, error in [
-        ({"model": "gpt"}, "model: expected one of bc, cpn, random, te-bc, upn, got gpt"),
+        ({"model": "gpt"}, "model: expected one of bc, cpn, cpn-position, random, te-bc, upn, got gpt"),
         ({"observation/image": large}, "observation/image.height: expected 84, got 224"),
         ({"observation/image": frame / 255}, "observation/image: expected dtype .* got dtype <f8, shape"),
         ({"goal/image": goal[..., 0]}, r"goal/image: expected dtype .* shape \[84, 84\]"),

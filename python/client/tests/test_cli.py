@@ -149,6 +149,7 @@ def test_models_are_those_of_the_folder(shell: Shell) -> None:
     assert header.split() == ["name", "method", "version", "horizon", "training", "tasks", "digest"]
     assert [row.split()[:5] for row in rows if row.startswith(("cpn", "random"))] == [
         ["cpn", "cpn", "0", "5", "20"],
+        ["cpn-position", "cpn", "0", "5", "20"],
         ["random", "random", "0", "1", "0"],
     ]
 
