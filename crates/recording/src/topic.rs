@@ -75,3 +75,23 @@ fn schema_of(file_name: &str) -> Vec<u8> {
 pub(crate) fn log_time_nanos(step: u32, control_hz: f64) -> u64 {
     (f64::from(step) * 1e9 / control_hz).round() as u64
 }
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a test")]
+mod tests {
+    use super::*;
+
+    /// A reader in another language builds the messages from the schema alone.
+    #[test]
+    fn schemas_have_every_import() {
+        for topic in [Topic::Episode, Topic::Camera, Topic::Step, Topic::Trial, Topic::PlanRequest, Topic::PlanResponse]
+        {
+            let set = FileDescriptorSet::decode(&topic.schema()[..]).unwrap();
+            for (at, file) in set.file.iter().enumerate() {
+                for import in &file.dependency {
+                    assert!(set.file[..at].iter().any(|file| file.name() == import), "{}: {import}", topic.name());
+                }
+            }
+        }
+    }
+}

@@ -44,7 +44,7 @@ keys! {
     sim_frame(worker) = "cpn/@v1/sim/${worker:*}/frame";
     /// Published actions, for watchers.
     sim_action(worker) = "cpn/@v1/sim/${worker:*}/action";
-    /// Published [`crate::trial::TrialPlan`], for watchers.
+    /// Published [`crate::sim::TrialPlan`], for watchers.
     sim_plan(worker) = "cpn/@v1/sim/${worker:*}/plan";
     /// Published [`crate::demonstration::DemonstrationStep`]; queryable, without a payload, once the episode is recorded.
     demonstration_step(episode, step) = "cpn/@v1/demonstration/${episode:*}/step/${step:*}";

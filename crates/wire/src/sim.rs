@@ -1,6 +1,7 @@
 //! Requests and responses of a simulator worker.
 
 use crate::message::{MAX_ACTION, action, required};
+use crate::planner::PlanResponse;
 use crate::{Error, Image, Message, Position, proto};
 
 /// Randomised initial state of an episode.
@@ -251,4 +252,35 @@ fn metres(position: Position) -> Vec<f32> {
 fn progress(value: f64) -> Result<f64, Error> {
     // Written so that NaN, which compares false with everything, is refused too.
     if (0.0..=1.0).contains(&value) { Ok(value) } else { Err(Error::invalid("progress", "0 to 1", value)) }
+}
+
+/// Plan of a trial, published for watchers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrialPlan {
+    /// Identifier of the simulator's episode.
+    pub episode_id: String,
+    /// Number of steps applied before the plan.
+    pub step: u32,
+    /// Name of the model.
+    pub model: String,
+    /// The planner's answer.
+    pub plan: PlanResponse,
+}
+
+impl Message for TrialPlan {
+    type Proto = proto::TrialPlan;
+}
+
+impl TryFrom<proto::TrialPlan> for TrialPlan {
+    type Error = Error;
+
+    fn try_from(proto::TrialPlan { episode_id, step, model, plan }: proto::TrialPlan) -> Result<Self, Error> {
+        Ok(Self { episode_id, step, model: crate::message::name("model", model)?, plan: required("plan", plan)? })
+    }
+}
+
+impl From<TrialPlan> for proto::TrialPlan {
+    fn from(TrialPlan { episode_id, step, model, plan }: TrialPlan) -> Self {
+        Self { episode_id, step, model, plan: Some(plan.into()) }
+    }
 }

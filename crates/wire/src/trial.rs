@@ -1,7 +1,6 @@
-//! Metadata of a recorded trial, and plans of one under way.
+//! Metadata of a recorded trial.
 
 use crate::message::{digest, name, required};
-use crate::planner::PlanResponse;
 use crate::sim::Variation;
 use crate::{Error, Image, Message, Observation, Position, proto};
 
@@ -69,36 +68,5 @@ impl From<RecordedTrial> for proto::RecordedTrial {
             steps,
             plans,
         }
-    }
-}
-
-/// Plan of a trial, published for watchers.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TrialPlan {
-    /// Identifier of the simulator's episode.
-    pub episode_id: String,
-    /// Number of steps applied before the plan.
-    pub step: u32,
-    /// Name of the model.
-    pub model: String,
-    /// The planner's answer.
-    pub plan: PlanResponse,
-}
-
-impl Message for TrialPlan {
-    type Proto = proto::TrialPlan;
-}
-
-impl TryFrom<proto::TrialPlan> for TrialPlan {
-    type Error = Error;
-
-    fn try_from(proto::TrialPlan { episode_id, step, model, plan }: proto::TrialPlan) -> Result<Self, Error> {
-        Ok(Self { episode_id, step, model: name("model", model)?, plan: required("plan", plan)? })
-    }
-}
-
-impl From<TrialPlan> for proto::TrialPlan {
-    fn from(TrialPlan { episode_id, step, model, plan }: TrialPlan) -> Self {
-        Self { episode_id, step, model, plan: Some(plan.into()) }
     }
 }

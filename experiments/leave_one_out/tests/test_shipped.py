@@ -5,7 +5,7 @@ from shipped import README, differences, read_table
 
 def test_the_table_of_readme_is_read() -> None:
     counts = read_table(README.read_text())
-    assert len(counts) == 9
+    assert len(counts) == 12
     assert {trials for _, trials in counts.values()} == {20}
     assert counts["door-lock", "random"] == (0, 20)
 

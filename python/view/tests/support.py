@@ -75,7 +75,7 @@ class Network:
         self.session.put(f"cpn/@v1/sim/{worker}/frame", message.SerializeToString())
 
     def plan(self, worker: str, step: int, plan: planner_pb2.PlanResponse, episode: str = "reach-0-ab") -> None:
-        message = trial_pb2.TrialPlan(episode_id=episode, step=step, model="cpn", plan=plan)
+        message = sim_pb2.TrialPlan(episode_id=episode, step=step, model="cpn", plan=plan)
         self.session.put(f"cpn/@v1/sim/{worker}/plan", message.SerializeToString())
 
     def action(self, worker: str, step: int, values: NDArray[np.float32], episode: str = "reach-0-ab") -> None:

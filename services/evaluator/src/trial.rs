@@ -247,7 +247,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
     use tokio::sync::watch;
     use wire::planner::{PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
-    use wire::trial::TrialPlan;
+    use wire::sim::TrialPlan;
     use wire::{Image, Position, query, sim};
     use zenoh::Session;
     use zenoh::key_expr::OwnedKeyExpr;

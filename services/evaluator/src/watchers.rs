@@ -3,7 +3,7 @@
 use crate::link::Link;
 use recording::trial::Exchange;
 use service_kit::session::IntoAnyhow;
-use wire::trial::TrialPlan;
+use wire::sim::TrialPlan;
 use wire::{encode, key, query};
 use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 import zenoh
 from google.protobuf.message import DecodeError, Message
 
-from cpn.v1 import sim_pb2, trial_pb2
+from cpn.v1 import sim_pb2
 from cpn_view.panels import ACTION_COLORS, ACTION_NAMES, PLAN_SERIES
 from cpn_view.worker import Worker, entity
 
@@ -76,7 +76,7 @@ class LiveView:
         self._take(self._frames, sim_pb2.Frame, Worker.frame)
         for worker in self._workers.values():
             worker.draw()
-        self._take(self._plans, trial_pb2.TrialPlan, Worker.plan)
+        self._take(self._plans, sim_pb2.TrialPlan, Worker.plan)
         # Last, so that no frame of a worker that is gone comes after its token.
         for sample in _waiting(self._tokens):
             name = str(sample.key_expr).rpartition("/")[2]

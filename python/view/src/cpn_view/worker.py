@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cpn.v1 import sim_pb2, trial_pb2
+from cpn.v1 import sim_pb2
 from cpn_view import panels
 
 MIN_DEGREES, MAX_DEGREES = 0.1, 179.9
@@ -61,7 +61,7 @@ class Worker:
             self._log("action", rr.Clear(recursive=False))
         self._log("action", rr.Scalars(message.action.values))
 
-    def plan(self, message: trial_pb2.TrialPlan) -> None:
+    def plan(self, message: sim_pb2.TrialPlan) -> None:
         """Shows a plan, and the positions of the hand under it if its episode is the one shown.
 
         Raises:
