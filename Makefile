@@ -24,7 +24,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz test-fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -195,8 +195,11 @@ test-experiment: setup $(EXPERIMENT)/.ready ## Run the experiment's smoke profil
 test-shipped: build ## Evaluate the shipped checkpoints, and hold README's table to every count
 	$(WORKER)/bin/python experiments/shipped.py
 
-fuzz: system ## Feed the decoders what a stranger may send, ten minutes each (FUZZ_SECONDS=n); an input that breaks one fails it
+fuzz: setup ## Fuzz each decoder of untrusted bytes for ten minutes (FUZZ_SECONDS=n); fails on an input that breaks one
 	scripts/fuzz.sh
+
+test-fuzz: export FUZZ_SECONDS := 10
+test-fuzz: fuzz ## Fuzz each decoder for ten seconds
 
 bench-sim: build ## Compare frames, steps and demonstrations with stock Meta-World
 	cd sim-worker && $(UV) run --quiet benches/sim.py
@@ -226,16 +229,14 @@ deny: $(TOOLS)/bin/cargo-deny ## Check licences and sources of dependencies (adv
 
 lint: setup ## Formatting, lints, types
 	cargo fmt --all --check
-	cd fuzz && cargo fmt --check && cargo metadata --locked --filter-platform x86_64-unknown-linux-gnu --format-version 1 >/dev/null
-	cargo clippy --workspace --all-targets --locked -- -D warnings
+	cargo clippy --workspace --all-targets --features fuzz/fuzzers --locked -- -D warnings
 	cargo clippy --package planner --package trainer --no-default-features --locked -- -D warnings
 	cd sim-worker && $(UV) run --quiet ruff check $(PYTHON) && $(UV) run --quiet ruff format --check $(PYTHON) && $(UV) run --quiet basedpyright
 	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
 
 format: setup ## Lay out all code
 	cargo fmt --all
-	cd fuzz && cargo fmt
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target fuzz/target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(VIEW) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch
+	rm -rf target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(VIEW) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch

@@ -38,6 +38,7 @@ fn each_crate_depends_only_on_permitted_ones() {
         ("planner", &["cpn", "engines", "signing", "wire", "service-kit"]),
         ("trainer", &["cpn", "engines", "recording", "signing", "wire", "service-kit"]),
         ("evaluator", &["recording", "wire", "service-kit"]),
+        ("fuzz", &["cpn", "planner", "recording", "signing", "wire"]),
     ]);
     let dependencies = dependencies();
     assert_eq!(
