@@ -41,6 +41,9 @@ NOISY_EPOCHS = {"training.epochs": 6}
 AUGMENTED = {"training.goals": "hindsight", "training.shift_pixels": 4}
 POSITION_DYNAMICS = {"model.position_dynamics": "true", "model.updates": 5} | DYNAMICS | POSITION
 
+CONTROLS = ("no-op", "oracle")
+"""Controls of the evaluator."""
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -58,6 +61,11 @@ class Arm:
     def dataset(self) -> Path:
         """Folder of the demonstrations."""
         return NOISY if self.noise else DATASET
+
+    @property
+    def is_trained(self) -> bool:
+        """False for a control of the evaluator."""
+        return self.method not in CONTROLS
 
     @property
     def plans(self) -> bool:
@@ -78,8 +86,8 @@ ARMS = {
     "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
     "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, noise=NOISE),
     "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, noise=NOISE),
-}
-REPORTED_ARMS = {"te-bc": (0,), "position-te-bc": (0,), "paper": (1,), "position-dynamics": (0, 5)}
+} | {control: Arm(method=control) for control in CONTROLS}
+REPORTED_ARMS = {control: (0,) for control in CONTROLS} | {"te-bc": (0,), "position-te-bc": (0,), "paper": (1,), "position-dynamics": (0, 5)}
 """Arms that are run on the reported tasks, with their numbers of updates."""
 SEEDS = (0, 1)
 TRIALS = 20
@@ -124,12 +132,12 @@ def run(cell: Cell) -> None:
     out, recipe = ROOT / f"runs/ablations/{cell.group}/{cell.arm}-{cell.seed}", ARMS[cell.arm]
     checkpoint = out / f"models/{recipe.method}.safetensors"
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    settings = SETTINGS | recipe.settings
-    options = ["--preset", f"paper-{recipe.method}", "--dataset", str(recipe.dataset), "--seed", str(cell.seed)]
-    options += ["--hold-out", ",".join(GROUPS[cell.group]), "--run-dir", str(out / "run")]
-    options += [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
     with Lab(out) as lab:
-        if not checkpoint.exists():
+        if recipe.is_trained and not checkpoint.exists():
+            settings = SETTINGS | recipe.settings
+            options = ["--preset", f"paper-{recipe.method}", "--dataset", str(recipe.dataset), "--seed", str(cell.seed)]
+            options += ["--hold-out", ",".join(GROUPS[cell.group]), "--run-dir", str(out / "run")]
+            options += [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
             train(lab, checkpoint, *options)
         lab.planner(checkpoint.parent)
         lab.worker("w0")
@@ -149,7 +157,8 @@ def keep(cell: Cell, out: Path) -> None:
             trial = json.loads(path.read_text())
             by_task.setdefault(trial["task"], []).append(int(trial["outcome"] == "success"))
     result = {"arm": cell.arm, "seed": cell.seed, "method": recipe.method, "noise": recipe.noise}
-    result |= {"held_out": GROUPS[cell.group], "settings": SETTINGS | recipe.settings, "successes": successes}
+    result |= {"held_out": GROUPS[cell.group], "settings": SETTINGS | recipe.settings if recipe.is_trained else {}}
+    result |= {"successes": successes}
     cell.result.parent.mkdir(parents=True, exist_ok=True)
     cell.result.write_text(json.dumps(result) + "\n")
 
@@ -218,6 +227,7 @@ def ablations() -> None:
             Cell(group, arm, seed)
             for group, seed in product(arguments.groups, arguments.seeds)
             for arm in arguments.arms or (ARMS if group == "development" else REPORTED_ARMS)
+            if ARMS[arm].is_trained or seed == SEEDS[0]
         ]
         record()
         if any(ARMS[cell.arm].noise for cell in cells):

@@ -1,8 +1,9 @@
 """Executes plans and baselines in the simulated arm, each on the same variations.
 
-Five ways to move: CPN's trajectory, planned before the hand moves; the same of CPN trained with goals in hindsight; CPN
-planning anew at every step; the recorded actions of the nearest demonstration; a straight line of the fingertip, by
-inverse kinematics. Models are named `cpn-<seed>` and `hindsight-<seed>`.
+Controllers: trajectories planned before the hand moves, by CPN, by CPN trained with goals in hindsight, by CPN with position
+dynamics, and by the policy of the latter, without updates; CPN planning anew at every step, with position dynamics and
+without; the recorded actions of the nearest demonstration; a straight line of the fingertip, by inverse kinematics. Models
+are named `cpn-<seed>`, `hindsight-<seed>` and `position-<seed>`.
 
 Each trial is a line of `trials.jsonl` as soon as it is done; a second run executes the missing ones.
 """
@@ -36,7 +37,7 @@ Move = Callable[[Array, Array], Iterator[Array]]
 
 @dataclass(frozen=True)
 class Trial:
-    """One way to move, on one variation."""
+    """An episode of a controller on one variation."""
 
     method: str
     model: str
@@ -53,13 +54,13 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to move, and how it is called."""
+class Controller:
+    """A controller and its name."""
 
     method: str
     model: str
     actions: Callable[[Array, Array], Array] | None
-    """All actions from start and goal; none if the model plans at every step."""
+    """All actions from start and goal; none for a model that plans at every step."""
 
 
 def straight(start: Array, goal: Array) -> Array:
@@ -77,19 +78,21 @@ def nearest(recorded: list[Demonstration]) -> Callable[[Array, Array], Array]:
     return lambda start, goal: min(recorded, key=lambda d: distance(d, start, goal)).actions
 
 
-def run(session: zenoh.Session, worker: str, planner: Planner, way: Way, task: str, seed: int, length: int) -> Trial:
+def run(
+    session: zenoh.Session, worker: str, planner: Planner, controller: Controller, task: str, seed: int, length: int
+) -> Trial:
     """Moves until the block is poked, or for `length` steps and a rest."""
     variation = types_pb2.Variation(task=task, seed=seed)
     reset = sim_pb2.ResetRequest(variation=variation)
     start = request(session, keys.sim_reset(worker), reset, sim_pb2.ResetResponse)
     hand, goal = np.array(start.hand_position, np.float64), np.array(start.goal_position, np.float64)
-    planned = None if way.actions is None else way.actions(hand, goal)
+    planned = None if controller.actions is None else controller.actions(hand, goal)
     executed, success = [hand.tolist()], False
     for step in range(length + REST_STEPS):
         action = np.zeros(3)
         if planned is None:
             if step < length:
-                action = planner.plan(way.model, hand, goal)[0]
+                action = planner.plan(controller.model, hand, goal)[0]
         elif step < len(planned):
             action = planned[step]
         message = sim_pb2.StepRequest(
@@ -101,7 +104,7 @@ def run(session: zenoh.Session, worker: str, planner: Planner, way: Way, task: s
         if response.done:
             break
     predicted = [] if planned is None else along(np.array(executed[0]), planned).tolist()
-    return Trial(way.method, way.model, task, seed, goal.tolist(), predicted, executed, success)
+    return Trial(controller.method, controller.model, task, seed, goal.tolist(), predicted, executed, success)
 
 
 def done(path: Path) -> set[tuple[str, str, str, int]]:
@@ -121,20 +124,26 @@ def execute(
         recorded = demonstrations(session, episodes)
         (folder / "demonstrations.json").write_text(json.dumps([d.positions.tolist() for d in recorded]) + "\n")
         planner, length = Planner(session, planner_name), max(len(d.actions) for d in recorded)
-        ways = [Way("line", "", straight), Way("nearest", "", nearest(recorded))]
+        controllers = [Controller("line", "", straight), Controller("nearest", "", nearest(recorded))]
         for model in models:
             method = model.split("-")[0]
-            ways.append(Way(method, model, lambda s, g, model=model: planner.trajectory(model, s, g, length)))
-            if method == "cpn":
-                ways.append(Way("cpn-mpc", model, None))
+            controllers.append(
+                Controller(method, model, lambda s, g, model=model: planner.trajectory(model, s, g, length))
+            )
+            if method != "hindsight":
+                controllers.append(Controller(f"{method}-mpc", model, None))
+            if method == "position":
+                controllers.append(
+                    Controller("policy", model, lambda s, g, model=model: planner.trajectory(model, s, g, length, 0))
+                )
         path = folder / "trials.jsonl"
         earlier = done(path)
         jobs = [
-            (way, task, seed)
+            (controller, task, seed)
             for task, n in VARIATIONS.items()
             for seed in range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + n)
-            for way in ways
-            if (way.method, way.model, task, seed) not in earlier
+            for controller in controllers
+            if (controller.method, controller.model, task, seed) not in earlier
         ]
         writing = threading.Lock()
 

@@ -90,20 +90,24 @@ class Planner:
         self._session = session
         self._name = name
 
-    def plan(self, model: str, hand: Array, goal: Array) -> Array:
-        """The next actions of the hand towards the goal, [H, 3], clipped to [-1, 1]."""
-        message = planner_pb2.PlanRequest(model=model, position=_point(hand), goal_position=_point(goal))
+    def plan(self, model: str, hand: Array, goal: Array, updates: int | None = None) -> Array:
+        """The next actions of the hand towards the goal, [H, 3], clipped to [-1, 1]; with the model's own number of updates if
+        none is given."""
+        search = None if updates is None else planner_pb2.Search(iterations=updates)
+        message = planner_pb2.PlanRequest(
+            model=model, position=_point(hand), goal_position=_point(goal), search=search
+        )
         response = request(self._session, keys.planner_plan(self._name), message, planner_pb2.PlanResponse)
         return np.clip([action.values for action in response.actions], -1, 1)
 
-    def trajectory(self, model: str, start: Array, goal: Array, length: int) -> Array:
+    def trajectory(self, model: str, start: Array, goal: Array, length: int, updates: int | None = None) -> Array:
         """A whole trajectory planned before the hand moves, as actions, [length, 3].
 
         The next plan starts where the one before is predicted to end: an action of 1 moves the hand 1 cm.
         """
         actions = np.empty((0, 3))
         while len(actions) < length:
-            actions = np.concatenate([actions, self.plan(model, along(start, actions)[-1], goal)])
+            actions = np.concatenate([actions, self.plan(model, along(start, actions)[-1], goal, updates)])
         return actions[:length]
 
 

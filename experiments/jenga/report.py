@@ -18,9 +18,14 @@ METHODS = {
     "cpn": "CPN, one trajectory",
     "hindsight": "the same, goals in hindsight",
     "cpn-mpc": "CPN, planned anew at each step",
+    "position": "position dynamics, one trajectory",
+    "policy": "the same weights without updates",
+    "position-mpc": "position dynamics, planned anew at each step",
     "nearest": "nearest demonstration",
     "line": "straight line, inverse kinematics",
 }
+REFERENCE = "position"
+"""Method whose paired differences to the others are reported, and whose trajectories are drawn."""
 TASKS = {"jenga-poke": "trained row", "jenga-poke-offset": "offset rows"}
 SHOWN = 6
 """Offset variations in the picture: one of each target."""
@@ -55,7 +60,7 @@ def summarise(trials: Trials) -> list[dict]:
     rows = []
     for task in TASKS:
         of_task = [trial for trial in trials if trial["task"] == task]
-        reference = by_seed([trial for trial in of_task if trial["method"] == "cpn"], "endpoint_cm").mean(axis=1)
+        reference = by_seed([trial for trial in of_task if trial["method"] == REFERENCE], "endpoint_cm").mean(axis=1)
         for method in METHODS:
             mine = [trial for trial in of_task if trial["method"] == method]
             row: dict = {"task": task, "method": method, "variations": len({trial["seed"] for trial in mine})}
@@ -67,9 +72,9 @@ def summarise(trials: Trials) -> list[dict]:
                     row[measure] = {"mean": float(values.mean()), "interval": interval(values)}
             values = by_seed(mine, "endpoint_cm")
             row["endpoint_cm_of_each_checkpoint"] = values.mean(axis=0).tolist()
-            if method != "cpn":
+            if method != REFERENCE:
                 difference = reference - values.mean(axis=1)
-                row["cpn_minus_this_cm"] = {"mean": float(difference.mean()), "interval": interval(difference)}
+                row["reference_minus_this_cm"] = {"mean": float(difference.mean()), "interval": interval(difference)}
             pokes = by_seed(mine, "success")
             wilson = binomtest(int(pokes.sum()), pokes.size).proportion_ci(method="wilson")
             row["pokes"] = {"successes": int(pokes.sum()), "n": pokes.size, "interval": [wilson.low, wilson.high]}
@@ -88,24 +93,24 @@ def table(rows: list[dict]) -> str:
         return f"{row[measure]['mean']:.2f} ({low:.2f} to {high:.2f})"
 
     lines = [
-        "| targets | method | predicted end, cm | executed end, cm | closest, cm | CPN minus this, cm | pokes |",
+        "| targets | method | predicted end, cm | executed end, cm | closest, cm | position dynamics minus this, cm | pokes |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         pokes = row["pokes"]
         low, high = (round(100 * value) for value in pokes["interval"])
         share = f"{pokes['successes']}/{pokes['n']} ({low} to {high} %)"
-        cells = [cm(row, m) for m in ("predicted_cm", "endpoint_cm", "closest_cm", "cpn_minus_this_cm")]
+        cells = [cm(row, m) for m in ("predicted_cm", "endpoint_cm", "closest_cm", "reference_minus_this_cm")]
         lines.append(f"| {' | '.join([TASKS[row['task']], METHODS[row['method']], *cells, share])} |")
     return "\n".join(lines) + "\n"
 
 
 def draw(demonstrations: list[list[list[float]]], trials: Trials, path: Path) -> None:
     """Trajectories from above and from the side: demonstrated, planned and executed, for one checkpoint."""
-    model = min(trial["model"] for trial in trials if trial["model"])
+    model = min(trial["model"] for trial in trials if trial["method"] == REFERENCE)
     figure, axes = plt.subplots(2, 2, figsize=(9, 7), sharex=True, layout="constrained")
     for column, task in zip(axes.T, TASKS, strict=True):
-        shown = [t for t in trials if (t["task"], t["method"], t["model"]) == (task, "cpn", model)][:SHOWN]
+        shown = [t for t in trials if (t["task"], t["method"], t["model"]) == (task, REFERENCE, model)][:SHOWN]
         for axis, (name, second) in zip(column, (("y", 1), ("z", 2)), strict=True):
             for number, demonstration in enumerate(demonstrations):
                 line = np.array(demonstration)
@@ -130,12 +135,13 @@ def draw(demonstrations: list[list[list[float]]], trials: Trials, path: Path) ->
 
 def report(folder: Path) -> None:
     """Writes report.json, report.md and trajectories.png beside the files of choose.py and execute.py."""
-    demonstrations, grid = (json.loads((folder / f"{name}.json").read_text()) for name in ("demonstrations", "../grid"))
+    demonstrations = json.loads((folder / "demonstrations.json").read_text())
+    selection = {path.stem: json.loads(path.read_text()) for path in sorted(folder.parent.glob("grid-*.json"))}
     # Two workers write as they come; the picture and the pairs want an order.
     lines = (folder / "trials.jsonl").read_text().splitlines()
     trials = sorted(map(measured, map(json.loads, lines)), key=lambda trial: trial["seed"])
     rows = summarise(trials)
-    contents = {"command": "make jenga", "selection": grid, "rows": rows}
+    contents = {"command": "make jenga", "selection": selection, "rows": rows}
     (folder / "report.json").write_text(json.dumps(contents, indent=2) + "\n")
     (folder / "report.md").write_text(table(rows))
     draw(demonstrations, trials, folder / "trajectories.png")

@@ -1,10 +1,11 @@
 """The paper's Jenga experiment in the simulated arm.
 
-21 demonstrations, a model of positions for each horizon and number of updates, the pair whose plans end nearest to the
-trained targets, then plans to trained and to offset targets, executed. An interrupted run resumes.
+21 demonstrations; for each recipe, a model of positions for each horizon and number of updates, and the pair whose plans end
+nearest to the trained targets; then plans to trained and to offset targets, executed. An interrupted run resumes.
 """
 
 import sys
+from itertools import product
 from pathlib import Path
 
 from choose import choose
@@ -14,23 +15,28 @@ from report import report
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from lab import PROGRAMS, ROOT, Lab, main, on_every_core, train
 
-GRID = ((8, 2), (8, 1), (5, 2), (3, 2), (5, 1), (3, 1), (1, 2), (1, 1))
-"""Horizons and updates to choose from."""
+GRIDS = {
+    "jenga": ((8, 2), (8, 1), (5, 2), (3, 2), (5, 1), (3, 1), (1, 2), (1, 1)),
+    "jenga-position": tuple(product((8, 5, 3, 1), (5, 2, 1))),
+}
+"""Horizons and updates to choose from, by preset."""
+MODELS = {"cpn": ("jenga", "final"), "hindsight": ("jenga", "hindsight"), "position": ("jenga-position", "final")}
+"""Preset and goals of the executed models."""
 SEEDS = (0, 1, 2)
-"""Training seeds of the chosen pair."""
+"""Training seeds of the executed models."""
 DEMONSTRATIONS = 21
 DATASET = ROOT / "data/jenga"
 OUT = ROOT / "runs/jenga"
 WORKERS = ("w0", "w1")
 
 
-def train_missing(lab: Lab, out: Path, horizon: int, updates: int, seed: int, goals: str) -> None:
-    """Trains a model of positions, unless it is there."""
+def train_missing(lab: Lab, out: Path, preset: str, pair: tuple[int, int], seed: int, goals: str) -> None:
+    """Trains a model of positions with a horizon and a number of updates, unless it is there."""
     if out.exists():
         return
-    settings = {"model.horizon": horizon, "model.updates": updates, "training.goals": goals}
+    settings = {"model.horizon": pair[0], "model.updates": pair[1], "training.goals": goals}
     options = [option for name, value in settings.items() for option in ("--set", f"{name}={value}")]
-    options += ["--preset", "jenga", "--dataset", str(DATASET), "--seed", str(seed)]
+    options += ["--preset", preset, "--dataset", str(DATASET), "--seed", str(seed)]
     train(lab, out, *options, "--run-dir", str(out.with_suffix("")))
 
 
@@ -39,8 +45,22 @@ def names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.safetensors"))
 
 
+def choose_pair(lab: Lab, preset: str, episodes: list[str]) -> tuple[int, int]:
+    """Horizon and number of updates of a preset, by the paper's rule."""
+    grid = OUT / f"grid-{preset}"
+    grid.mkdir(exist_ok=True)
+    on_every_core(
+        lambda pair: train_missing(lab, grid / f"h{pair[0]}-u{pair[1]}.safetensors", preset, pair, 0, "final"),
+        GRIDS[preset],
+    )
+    lab.planner(grid, name=grid.name)
+    pair = choose(lab.endpoint, grid.name, grid.with_suffix(".json"), episodes, names(grid))
+    print(f"{preset}: chosen H = {pair[0]}, U = {pair[1]}")
+    return pair
+
+
 def jenga() -> None:
-    """Leaves report and trajectories in a folder of runs/jenga that is named after the chosen pair."""
+    """Leaves report and trajectories in a folder of runs/jenga that is named after the chosen pairs."""
     episodes = [f"jenga-poke-{seed}" for seed in range(DEMONSTRATIONS)]
     with Lab(OUT) as lab:
         lab.trainer(DATASET)
@@ -48,24 +68,16 @@ def jenga() -> None:
         verify = ["verify", "--dataset", str(DATASET), "--episodes", str(DEMONSTRATIONS)]
         lab.run([str(PROGRAMS / "cpn-trainer"), *verify])
 
-        grid = OUT / "grid"
-        grid.mkdir(exist_ok=True)
-        on_every_core(
-            lambda pair: train_missing(lab, grid / f"h{pair[0]}-u{pair[1]}.safetensors", *pair, 0, "final"), GRID
-        )
-        lab.planner(grid, name="grid")
-        horizon, updates = choose(lab.endpoint, "grid", OUT / "grid.json", episodes, names(grid))
-        print(f"chosen: H = {horizon}, U = {updates}")
-
-        chosen = OUT / f"chosen-h{horizon}-u{updates}"
+        pairs = {preset: choose_pair(lab, preset, episodes) for preset in GRIDS}
+        chosen = OUT / "-".join(["chosen", *(f"h{horizon}-u{updates}" for horizon, updates in pairs.values())])
         chosen.mkdir(exist_ok=True)
-        runs = [
-            (method, goals, seed) for seed in SEEDS for method, goals in (("cpn", "final"), ("hindsight", "hindsight"))
-        ]
-        on_every_core(
-            lambda run: train_missing(lab, chosen / f"{run[0]}-{run[2]}.safetensors", horizon, updates, run[2], run[1]),
-            runs,
-        )
+
+        def train_model(run: tuple[int, str]) -> None:
+            seed, name = run
+            preset, goals = MODELS[name]
+            train_missing(lab, chosen / f"{name}-{seed}.safetensors", preset, pairs[preset], seed, goals)
+
+        on_every_core(train_model, list(product(SEEDS, MODELS)))
         lab.planner(chosen, name=chosen.name)
         for worker in WORKERS:
             lab.worker(worker)

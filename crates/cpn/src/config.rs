@@ -150,6 +150,18 @@ impl EncoderConfig {
         Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent: 16, layer_norm: true })
     }
 
+    /// A linear encoder of positions with mean `centre_mm` and standard deviation `scale_mm`, in millimetres, for position dynamics.
+    /// Training begins with the identity: an embedding is the standardised position.
+    pub fn linear_position(centre_mm: [i64; 3], scale_mm: i64) -> Self {
+        let (layers, latent) = (Vec::new(), positions::SIZE);
+        Self::Position(PositionEncoderConfig { centre_mm, scale_mm, layers, latent, layer_norm: false })
+    }
+
+    /// True if an embedding is a linear function of a position.
+    pub fn is_linear(&self) -> bool {
+        matches!(self, Self::Position(position) if position.layers.is_empty() && !position.layer_norm)
+    }
+
     /// Kind of observations that it embeds.
     pub fn input(&self) -> Input {
         match self {

@@ -10,10 +10,6 @@ use rand_chacha::ChaCha8Rng;
 /// training.
 const GATE_BIAS: f32 = 2.0;
 
-/// α of position dynamics, which are not trained through updates. In standard deviations of the position an action moves the hand by
-/// some hundredths, so that an update with α = 1 would hardly change an action.
-const POSITION_STEP_SIZE: f32 = 20.0;
-
 /// Bound of the initial motion of the position by an action, in standard deviations of the position.
 const POSITION_MOTION: f32 = 0.1;
 
@@ -44,22 +40,38 @@ pub enum Init {
     Constant(f32),
     /// Uniform between minus and plus a bound.
     Uniform(f32),
+    /// 1 on a matrix's diagonal, else 0.
+    Identity,
 }
 
 impl Model {
     /// A newly initialised model of a valid configuration. Equal seeds give equal weights, on every machine.
     pub fn new(config: ModelConfig, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut draw = |init| match init {
-            Init::Constant(value) => value,
-            Init::Uniform(bound) => rng.random_range(-bound..=bound),
-        };
         let mut weight = |Parameter { name, shape, init }: Parameter| {
-            let elements: Vec<f32> = (0..shape.iter().product()).map(|_| draw(init)).collect();
+            let draw = |i: usize| match init {
+                Init::Constant(value) => value,
+                Init::Uniform(bound) => rng.random_range(-bound..=bound),
+                Init::Identity => f32::from(i / shape[1] == i % shape[1]),
+            };
+            let elements: Vec<f32> = (0..shape.iter().product()).map(draw).collect();
             (name, Tensor::new(&shape, &elements))
         };
         let weights = parameters(&config).into_iter().map(&mut weight).collect();
         Self { config, weights }
+    }
+
+    /// Sets α of position dynamics, which are not trained through updates, to 2 / (H ‖W‖²), W being the motion of the position by an
+    /// action, `[3, A]`. An update then takes two thirds of the way to the goal where all axes move alike, and cannot diverge where
+    /// they do not. Other models stay as they are.
+    pub fn set_position_step_size(&mut self) {
+        if !self.config.position_dynamics {
+            return;
+        }
+        let motion: Vec<f32> = self.weights["network.position.weight"].elements().expect("weights are float32");
+        let norm_squared: f32 = motion.iter().map(|element| element * element).sum();
+        let step_size = 2.0 / (self.config.horizon as f32 * norm_squared.max(f32::EPSILON));
+        self.weights.insert("step_size".to_owned(), Tensor::new(&[], &[step_size]));
     }
 }
 
@@ -68,8 +80,7 @@ pub fn parameters(config: &ModelConfig) -> Vec<Parameter> {
     let mut list = Parameters(Vec::new());
     list.encoder(&config.encoder);
     list.network(config);
-    let step_size = if config.position_dynamics { POSITION_STEP_SIZE } else { 1.0 };
-    list.push("step_size", &[], Init::Constant(step_size));
+    list.push("step_size", &[], Init::Constant(1.0));
     list.0
 }
 
@@ -103,7 +114,12 @@ impl Parameters {
             EncoderConfig::Position(config) => self.position_features(config),
         };
         let latent = config.latent();
-        self.linear("encoder.linear", features, latent);
+        if config.is_linear() {
+            self.push("encoder.linear.weight", &[latent, features], Init::Identity);
+            self.bias("encoder.linear", latent, Init::Constant(0.0));
+        } else {
+            self.linear("encoder.linear", features, latent);
+        }
         if config.layer_norm() {
             self.push("encoder.norm.weight", &[latent], Init::Constant(1.0));
             self.bias("encoder.norm", latent, Init::Constant(0.0));
@@ -182,6 +198,7 @@ mod tests {
                 let elements: Vec<f32> = tensor.elements().expect("float32");
                 match init {
                     Init::Constant(value) => assert!(elements.iter().all(|element| *element == value), "{name}"),
+                    Init::Identity => unreachable!("a model of images"),
                     Init::Uniform(bound) => {
                         let largest = elements.iter().fold(0.0f32, |most, element| most.max(element.abs()));
                         assert!(largest <= bound && largest > bound / 2.0, "{name}: {largest} of {bound}");
@@ -189,6 +206,31 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_step_size_of_position_dynamics_is_two_thirds_of_the_way_to_the_goal() {
+        let config =
+            ModelConfig { position_dynamics: true, horizon: 4, actions: 3, ..ModelConfig::paper(MethodKind::Cpn) };
+        let step_size = |model: &Model| model.weights["step_size"].elements::<f32>().expect("float32")[0];
+        let mut model = Model::new(config, 0);
+        let motion = [0.5f32, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5];
+        model.weights.insert("network.position.weight".to_owned(), Tensor::new(&[3, 3], &motion));
+        model.set_position_step_size();
+        // An update moves the position by α H W Wᵀ times the error.
+        assert_eq!(step_size(&model) * 4.0 * 0.25, 2.0 / 3.0);
+
+        let mut model = Model::new(ModelConfig::paper(MethodKind::Cpn), 0);
+        model.set_position_step_size();
+        assert_eq!(step_size(&model), 1.0);
+    }
+
+    #[test]
+    fn a_linear_encoder_begins_as_the_identity() {
+        let encoder = EncoderConfig::linear_position([0; 3], 1);
+        let model = Model::new(ModelConfig { encoder, ..ModelConfig::paper(MethodKind::Cpn) }, 0);
+        let elements: Vec<f32> = model.weights["encoder.linear.weight"].elements().expect("float32");
+        assert_eq!(elements, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
     }
 
     /// A change here changes all trained weights.

@@ -93,6 +93,8 @@ pub enum Preset {
     CpnPosition,
     /// Contextual planning network of positions in the Jenga scene (section "JENGA domain on a physical robot").
     Jenga,
+    /// As `jenga`, with a linear encoder and position dynamics: updates lead to targets that no demonstration has.
+    JengaPosition,
 }
 
 /// Mean position of the hand and its goals in the Jenga scene, in millimetres: of 21 demonstrations of `jenga-poke` with the seeds
@@ -103,7 +105,7 @@ const JENGA_SCALE_MM: i64 = 62;
 
 impl Preset {
     /// All presets, in the order of lists.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::PaperBc,
         Self::PaperTeBc,
         Self::PaperTeBcHorizon,
@@ -112,6 +114,7 @@ impl Preset {
         Self::Cpn,
         Self::CpnPosition,
         Self::Jenga,
+        Self::JengaPosition,
     ];
 
     /// Name on the command line.
@@ -125,6 +128,7 @@ impl Preset {
             Self::Cpn => "cpn",
             Self::CpnPosition => "cpn-position",
             Self::Jenga => "jenga",
+            Self::JengaPosition => "jenga-position",
         }
     }
 
@@ -170,6 +174,21 @@ impl Preset {
                 },
                 training: Training { epochs: 60, batch_size: 64, ..Training::paper() },
             },
+            Self::JengaPosition => {
+                let Recipe { model, training } = Self::Jenga.recipe();
+                Recipe {
+                    model: ModelConfig {
+                        encoder: EncoderConfig::linear_position(JENGA_CENTRE_MM, JENGA_SCALE_MM),
+                        position_dynamics: true,
+                        updates: 5,
+                        ..model
+                    },
+                    training: Training {
+                        losses: Losses { every_update: false, dynamics: 1.0, position: 1.0 },
+                        ..training
+                    },
+                }
+            }
         }
     }
 }
@@ -219,8 +238,9 @@ impl Training {
 }
 
 impl Recipe {
-    /// Checks every value against its range. Augmentation and the position loss are allowed only with images, losses of plans only
-    /// for methods that plan. Position dynamics are allowed only with images, and need the dynamics loss and the position loss.
+    /// Checks every value against its range. Augmentation is allowed only with images, losses of plans only for methods that plan.
+    /// Position dynamics need the dynamics loss and the position loss, and no layer normalisation of positions, which would bound
+    /// them.
     ///
     /// # Errors
     /// The first field out of its range, with the range and the value.
@@ -231,17 +251,13 @@ impl Recipe {
             if self.training.colour_jitter != 0.0 {
                 return Err(ConfigError::new("training.colour_jitter", self.training.colour_jitter, 0, 0));
             }
-            if self.training.losses.position != 0.0 {
-                return Err(ConfigError::new("training.losses.position", self.training.losses.position, 0, 0));
-            }
         }
         if self.training.losses.position > 0.0 {
             in_range("encoder.latent", self.model.encoder.latent(), 3, 512)?;
         }
         if self.model.position_dynamics {
-            // The embedding of a position has no element that is a coordinate.
             if self.model.encoder.input() == Input::Position {
-                return Err(ConfigError::new("model.position_dynamics", true, "false (with positions)", false));
+                in_range("encoder.layer_norm", self.model.encoder.layer_norm().into(), 0, 0)?;
             }
             let Losses { every_update, dynamics, position } = self.training.losses;
             in_range("training.losses.every_update", every_update.into(), 0, 0)?;
@@ -267,7 +283,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn position_dynamics_need_images_and_their_losses() {
+    fn position_dynamics_need_their_losses_and_unbounded_positions() {
         let Recipe { model, training } = Preset::CpnPosition.recipe();
         let with =
             |losses| Recipe { model: model.clone(), training: Training { losses, ..training.clone() } }.validate();
@@ -281,10 +297,10 @@ mod tests {
             assert_eq!(with(losses).map_err(|error| error.field), Err(field));
         }
 
-        let of_positions = ModelConfig { encoder: EncoderConfig::position([0; 3], 1), ..model.clone() };
-        let plain = Losses { position: 0.0, ..losses };
-        let recipe = Recipe { model: of_positions, training: Training { losses: plain, ..training.clone() } };
-        assert_eq!(recipe.validate().map_err(|error| error.field), Err("model.position_dynamics"));
+        let with = |encoder| Recipe { model: ModelConfig { encoder, ..model.clone() }, training: training.clone() };
+        assert!(with(EncoderConfig::linear_position([0; 3], 1)).validate().is_ok());
+        let normalised = with(EncoderConfig::position([0; 3], 1));
+        assert_eq!(normalised.validate().map_err(|error| error.field), Err("encoder.layer_norm"));
 
         let policy = ModelConfig { position_dynamics: true, ..ModelConfig::paper(MethodKind::TeBc) };
         assert_eq!(policy.validate().map_err(|error| error.field), Err("position_dynamics"));

@@ -70,7 +70,7 @@ pub struct TrainArgs {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     out: Option<PathBuf>,
-    /// Recipe: paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position or jenga [default: cpn].
+    /// Recipe: paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position, jenga or jenga-position [default: cpn].
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     preset: Option<String>,
@@ -132,7 +132,7 @@ pub struct TrainerArgs {
 /// Arguments of `preset`.
 #[derive(Debug, Args)]
 pub struct PresetArgs {
-    /// One of paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position, jenga.
+    /// One of paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position, jenga, jenga-position.
     #[arg(default_value = "cpn")]
     pub name: String,
 }
@@ -142,7 +142,7 @@ pub struct PresetArgs {
 pub struct StartArgs {
     /// Name of the run and of its checkpoint.
     pub name: String,
-    /// Recipe: paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position or jenga [default: cpn].
+    /// Recipe: paper-bc, paper-te-bc, paper-te-bc-horizon, paper-upn, paper-cpn, cpn, cpn-position, jenga or jenga-position [default: cpn].
     #[arg(long)]
     pub preset: Option<String>,
     /// Tasks left out of training, separated by commas.

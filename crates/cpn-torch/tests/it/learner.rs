@@ -3,7 +3,7 @@
 use cpn::archive::Tensors;
 use cpn::engine::Native;
 use cpn::learner::LearnerError;
-use cpn::{Batch, Engine, Frames, Learner, Losses, MethodKind, Model, ModelConfig, Training};
+use cpn::{Batch, EncoderConfig, Engine, Frames, Learner, Losses, MethodKind, Model, ModelConfig, Training};
 use cpn_torch::loss::TensorBatch;
 use cpn_torch::{Agent, Torch, tensors};
 use tch::nn::OptimizerConfig;
@@ -22,9 +22,11 @@ fn engines() -> Vec<Box<dyn Engine>> {
 }
 
 fn configs() -> impl Iterator<Item = ModelConfig> {
-    let position_dynamics = ModelConfig { position_dynamics: true, ..small_config(MethodKind::Cpn) };
+    let position_dynamics = |config| ModelConfig { position_dynamics: true, ..config };
+    let encoder = EncoderConfig::linear_position([500, 0, -200], 400);
+    let linear = ModelConfig { encoder, ..position_config(MethodKind::Cpn) };
     let configs = MethodKind::ALL.into_iter().flat_map(|method| [small_config(method), position_config(method)]);
-    configs.chain([position_dynamics])
+    configs.chain([small_config(MethodKind::Cpn), linear].map(position_dynamics))
 }
 
 /// Six samples of four frames.

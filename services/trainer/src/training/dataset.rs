@@ -95,8 +95,14 @@ impl Dataset {
                 "{path}: actions: expected {action_size} values like the episodes before, got {got}"
             );
         }
-        let hand_positions: Option<Vec<_>> = read.iter().map(|steps| steps.hand_positions.as_deref()).collect();
-        let hand_positions = standardised(hand_positions.unwrap_or_default().concat());
+        let hand_positions = match &frames {
+            Frames::Images(_) => {
+                let read: Option<Vec<_>> = read.iter().map(|steps| steps.hand_positions.as_deref()).collect();
+                read.unwrap_or_default().concat()
+            }
+            Frames::Positions(positions) => positions.clone(),
+        };
+        let hand_positions = standardised(hand_positions);
         let (actions, applied_actions): (Vec<_>, Vec<_>) =
             read.into_iter().map(|steps| (steps.actions, steps.applied_actions)).unzip();
         let (actions, applied_actions) = (actions.concat(), applied_actions.concat());

@@ -123,7 +123,9 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
         seed: config.seed,
         training: training.clone(),
     };
-    let bytes = checkpoint::to_bytes(&learner.model(), &provenance)?;
+    let mut model = learner.model();
+    model.set_position_step_size();
+    let bytes = checkpoint::to_bytes(&model, &provenance)?;
     files::write_atomically(&config.out, &bytes)?;
     state.remove()?;
     Ok(Outcome::Finished { digest: checkpoint::digest(&bytes) })

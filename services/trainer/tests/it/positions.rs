@@ -42,23 +42,27 @@ fn config(folder: &Path) -> Config {
         STARTS.into_iter().zip(0..).for_each(|(start, seed)| keep(&dataset, &reach(seed, start)));
     }
     let config = Config::from(Preset::Jenga);
-    let training = Training { epochs: 150, batch_size: 16, ..config.training };
     // Short plans can be learnt from few demonstrations.
-    let model = ModelConfig { horizon: 1, updates: 1, ..config.model };
-    Config { dataset, out: folder.join("jenga.safetensors"), model, training, ..config }
+    let model = ModelConfig { horizon: 1, updates: 1, ..config.model.clone() };
+    few(Config { dataset, out: folder.join("jenga.safetensors"), model, ..config })
 }
 
-fn distance(hand: [f32; 3]) -> f32 {
-    hand.iter().zip(GOAL).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
+/// Settings for few demonstrations.
+fn few(config: Config) -> Config {
+    Config { training: Training { epochs: 150, batch_size: 16, ..config.training }, ..config }
 }
 
-/// Position of the hand after [`ACTIONS`] first actions of plans.
-fn end(model: &Model, mut hand: [f32; 3]) -> [f32; 3] {
+fn distance(hand: [f32; 3], goal: [f32; 3]) -> f32 {
+    hand.iter().zip(goal).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
+}
+
+/// Position of the hand after [`ACTIONS`] first actions of plans with a number of updates.
+fn end(model: &Model, mut hand: [f32; 3], goal: [f32; 3], updates: usize) -> [f32; 3] {
     let mut planner = Planner::new(model, Precision::Float32, 1);
     for _ in 0..ACTIONS {
-        let ends = planner.encode(&[Observed::Position(hand), Observed::Position(GOAL)]);
+        let ends = planner.encode(&[Observed::Position(hand), Observed::Position(goal)]);
         let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[] };
-        let iterations = Iterations::Fixed(model.config.updates as usize);
+        let iterations = Iterations::Fixed(updates);
         let plans = planner.plan(&[query], &mut Search { solver: Solver::Gradient, iterations });
         hand = [0, 1, 2].map(|axis| hand[axis] + plans[0].actions[0][axis].clamp(-1.0, 1.0) / 100.0);
     }
@@ -74,8 +78,27 @@ fn a_model_of_positions_learns_to_reach_a_goal() {
     let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
     assert_eq!((&loaded.model.config, loaded.provenance.render_spec.as_str()), (&config.model, ""));
     let start = [0.64, 0.01, 0.2];
-    let (before, after) = (distance(start), distance(end(&loaded.model, start)));
+    let (before, after) = (distance(start, GOAL), distance(end(&loaded.model, start, GOAL, 1), GOAL));
     assert!(after < before / 3.0, "{after} m from the goal, {before} m at the start");
+}
+
+#[test]
+fn position_dynamics_reach_goals_at_heights_without_demonstrations() {
+    let folder = tempfile::tempdir().unwrap();
+    let Config { dataset, out, .. } = config(folder.path());
+    let config = Config { dataset, out, ..Config::from(Preset::JengaPosition) };
+    // Of a plan over H steps the first goes a share of 1 / H.
+    let config = few(Config { model: ModelConfig { horizon: 2, ..config.model }, ..config });
+    run::run(&config, &mut StopIf(|_| false)).unwrap();
+    let model = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap().model;
+
+    let [start, goal] = [[0.64, 0.01, 0.2], [0.69, 0.0, 0.26]];
+    let [policy, planned] = [0, 5].map(|updates| distance(end(&model, start, goal, updates), goal));
+    assert!(planned < 0.005 && planned < policy / 3.0, "{planned} m from the goal, {policy} m without updates");
+
+    let mut again = model.clone();
+    again.set_position_step_size();
+    assert_eq!(again, model, "the step size is that of the trained motion");
 }
 
 #[test]

@@ -2,4 +2,5 @@
 
 pub mod encoder;
 pub mod policy_dynamics;
+pub mod position_dynamics;
 mod weights;

@@ -1,5 +1,6 @@
 //! Policy dynamics network g_θ, with its four passes over one step of a rollout.
 
+use super::position_dynamics::PositionDynamics;
 use crate::config::ModelConfig;
 use crate::engine::layers::dense::{Dense, DenseGradient, LayerTape};
 use crate::engine::layers::linear::Weights;
@@ -9,10 +10,6 @@ use crate::engine::layers::relu::{relu, relu_mask};
 use crate::engine::simd::buffer::{AlignedVec, zeros};
 use crate::engine::simd::element::Element;
 use crate::engine::simd::vector::add;
-use crate::positions;
-
-/// P, the number of elements of a position.
-const POSITION: usize = positions::SIZE as usize;
 
 /// Names of the branches' layers.
 const POLICY: [&str; 2] = ["policy_0", "policy_1"];
@@ -24,8 +21,7 @@ pub struct PolicyDynamics<T> {
     trunk: Dense<T>,
     policy: [Dense<T>; 2],
     dynamics: Option<[Dense<T>; 2]>,
-    /// Motion of the position, the first P elements of a state, by an action, `[P, A]`.
-    position: Option<Vec<T>>,
+    pub position: Option<PositionDynamics<T>>,
     pub sizes: Sizes,
 }
 
@@ -97,7 +93,7 @@ impl<T: Element> PolicyDynamics<T> {
             trunk: layer("trunk", 0),
             policy: POLICY.map(after_relu),
             dynamics: method.plans().then(|| DYNAMICS.map(after_relu)),
-            position: config.position_dynamics.then(|| weights.get("network.position.weight")),
+            position: PositionDynamics::new(config, weights),
             sizes: Sizes {
                 latent,
                 compared: config.compared_elements() as usize,
@@ -114,7 +110,7 @@ impl<T: Element> PolicyDynamics<T> {
             trunk: self.trunk.gradient(),
             policy: self.policy.each_ref().map(Dense::gradient),
             dynamics: self.dynamics.as_ref().map(|layers| layers.each_ref().map(Dense::gradient)),
-            position: self.position.as_ref().map(|weight| vec![T::ZERO; weight.len()]),
+            position: self.position.as_ref().map(PositionDynamics::gradient),
         }
     }
 
@@ -198,69 +194,17 @@ impl<T: Element> PolicyDynamics<T> {
         relu(second.x(rows));
         let change = &mut buffers.narrow[..rows * latent];
         layers[1].forward(rows, second, change);
-        self.move_position(rows, action, change);
-        add(x, change);
-    }
-
-    /// Overwrites the first P elements of each change of state, `[R, Z]`, with the motion by an action, `[R, A]`.
-    fn move_position(&self, rows: usize, action: &[T], change: &mut [T]) {
-        let Some(weight) = &self.position else { return };
-        let Sizes { latent, actions, .. } = self.sizes;
-        for r in 0..rows {
-            let action = &action[r * actions..][..actions];
-            for (change, weight) in change[r * latent..].iter_mut().zip(weight.chunks_exact(actions)) {
-                *change = weight.iter().zip(action).map(|(weight, action)| *weight * *action).sum();
+        match &self.position {
+            Some(position) => {
+                position.clear(change);
+                add(x, change);
+                position.next(action, x);
             }
+            None => add(x, change),
         }
     }
 
-    /// Adds the gradient through position dynamics, from x̄ of the next state, `[R, Z]`, to ā, `[R, A]`.
-    fn position_vjp(&self, rows: usize, x_bar: &[T], action_bar: &mut [T]) {
-        let Some(weight) = &self.position else { return };
-        let Sizes { latent, actions, .. } = self.sizes;
-        for r in 0..rows {
-            let action_bar = &mut action_bar[r * actions..][..actions];
-            for (x_bar, weight) in x_bar[r * latent..].iter().zip(weight.chunks_exact(actions)) {
-                for (action_bar, weight) in action_bar.iter_mut().zip(weight) {
-                    *action_bar += *x_bar * *weight;
-                }
-            }
-        }
-    }
-
-    /// Adds to the gradient of the position's weight, `[P, A]`, from R actions, `[A]` each, and x̂ of the next state, `[R, Z]`.
-    pub fn position_hat<'a>(&self, actions: impl Iterator<Item = &'a [T]>, x_hat: &[T], gradient: &mut Option<Vec<T>>) {
-        let Some(gradient) = gradient else { return };
-        for (action, x_hat) in actions.zip(x_hat.chunks_exact(self.sizes.latent)) {
-            for (x_hat, gradient) in x_hat.iter().zip(gradient.chunks_exact_mut(action.len())) {
-                for (gradient, action) in gradient.iter_mut().zip(action) {
-                    *gradient += *x_hat * *action;
-                }
-            }
-        }
-    }
-
-    /// True if actions move the positions by position dynamics.
-    pub fn has_position_dynamics(&self) -> bool {
-        self.position.is_some()
-    }
-
-    /// Moves the positions in the states x, `[R, Z]`, by an action, `[R, A]`, and leaves the other elements as they are.
-    pub fn next_position(&self, rows: usize, action: &[T], x: &mut [T], buffers: &mut Buffers<T>) {
-        let change = &mut buffers.narrow[..rows * self.sizes.latent];
-        change.fill(T::ZERO);
-        self.move_position(rows, action, change);
-        add(x, change);
-    }
-
-    /// Zeroes the first P elements of each gradient, `[R, Z]`: the dynamics branch does not affect them.
-    fn without_position(&self, x_bar: &mut [T]) {
-        if self.position.is_some() {
-            x_bar.chunks_exact_mut(self.sizes.latent).for_each(|x_bar| x_bar[..POSITION].fill(T::ZERO));
-        }
-    }
-
-    /// The gradient in state and action: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless `is_first`, and writes ā,
+    /// The gradient in state and action, without position dynamics: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless `is_first`, and writes ā,
     /// `[R, A]`.
     pub fn vjp(
         &self,
@@ -276,7 +220,6 @@ impl<T: Element> PolicyDynamics<T> {
 
         // Backward through the dynamics branch, to features and action.
         second.y_bar(rows).copy_from_slice(x_bar);
-        self.without_position(second.y_bar(rows));
         first.y_bar(rows).fill(T::ZERO);
         layers[1].vjp(rows, second, &mut buffers.gates, first.y_bar(rows));
         relu_mask(first.y_bar(rows), second.x(rows));
@@ -288,7 +231,6 @@ impl<T: Element> PolicyDynamics<T> {
             features_bar[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
             action_bar[r * actions..][..actions].copy_from_slice(&row[hidden..]);
         }
-        self.position_vjp(rows, x_bar, action_bar);
         if is_first {
             return;
         }
@@ -303,7 +245,7 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// The tangent of the next state: replaces ẋ, `[R, Z]`, from ȧ, `[R, A]`. At the first step ẋ is 0.
+    /// The tangent of the next state, without position dynamics: replaces ẋ, `[R, Z]`, from ȧ, `[R, A]`. At the first step ẋ is 0.
     pub fn jvp(
         &self,
         rows: usize,
@@ -341,7 +283,6 @@ impl<T: Element> PolicyDynamics<T> {
         second.x_dot(rows).copy_from_slice(hidden_dot);
         let change = &mut buffers.narrow[..rows * latent];
         layers[1].jvp(rows, second, change);
-        self.move_position(rows, action_dot, change);
         add(x_dot, change);
     }
 
@@ -366,7 +307,9 @@ impl<T: Element> PolicyDynamics<T> {
             (branches.dynamics, &self.dynamics, &mut step.dynamics, &mut gradient.dynamics)
         {
             second.y_hat(rows).copy_from_slice(hat.x);
-            self.without_position(second.y_hat(rows));
+            if let Some(position) = &self.position {
+                position.clear(second.y_hat(rows));
+            }
             first.y_hat(rows).fill(T::ZERO);
             layers[1].double_backward(rows, order, second, gates, first.y_hat(rows), &mut gradients[1]);
             relu_mask(first.y_hat(rows), second.x(rows));
@@ -377,9 +320,11 @@ impl<T: Element> PolicyDynamics<T> {
                 features_hat[r * hidden..][..hidden].copy_from_slice(&row[..hidden]);
                 add(&mut hat.action[r * actions..][..actions], &row[hidden..]);
             }
-            self.position_vjp(rows, hat.x, hat.action);
-            let inputs = first.x(rows).chunks_exact(hidden + actions);
-            self.position_hat(inputs.map(|input| &input[hidden..]), hat.x, &mut gradient.position);
+            if let (Some(position), Some(gradient)) = (&self.position, &mut gradient.position) {
+                position.vjp(hat.x, hat.action);
+                let inputs = first.x(rows).chunks_exact(hidden + actions);
+                position.accumulate(inputs.map(|input| &input[hidden..]), hat.x, gradient);
+            }
         }
 
         // Backward through the policy branch, to the features.

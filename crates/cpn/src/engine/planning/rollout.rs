@@ -38,6 +38,11 @@ impl<T: Element> Rollout<T> {
         let rows = x.len() / network.sizes.latent;
         let horizon = self.steps.len();
         for (t, action) in actions.chunks_mut(rows * network.sizes.actions).take(horizon).enumerate() {
+            if let (Some(position), Actions::Given | Actions::Moved) = (&network.position, source) {
+                // Only positions are compared, and nothing else of the states affects them.
+                position.next(action, x);
+                continue;
+            }
             let step = &mut self.steps[if purpose == Purpose::Loss { 0 } else { t }];
             if t > 0 || source != Actions::Moved {
                 network.features(rows, step, x, context);
@@ -68,6 +73,13 @@ impl<T: Element> Rollout<T> {
         }
 
         let gradients = self.gradient.chunks_mut(rows * network.sizes.actions);
+        if let Some(position) = &network.position {
+            for gradient in gradients.take(self.steps.len()) {
+                gradient.fill(T::ZERO);
+                position.vjp(x_bar, gradient);
+            }
+            return;
+        }
         for (t, (step, gradient)) in self.steps.iter_mut().zip(gradients).enumerate().rev() {
             network.vjp(rows, t == 0, step, x_bar, gradient, buffers);
         }

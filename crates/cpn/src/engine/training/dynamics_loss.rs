@@ -59,11 +59,12 @@ impl<T: Element> DynamicsLoss<T> {
             for (r, action) in action.chunks_exact_mut(actions).enumerate() {
                 action.copy_from_slice(applied(t, r));
             }
-            if network.has_position_dynamics() {
-                network.next_position(rows, action, x, buffers);
-            } else {
-                network.features(rows, step, x, context);
-                network.next(rows, step, action, x, buffers);
+            match &network.position {
+                Some(position) => position.next(action, x),
+                None => {
+                    network.features(rows, step, x, context);
+                    network.next(rows, step, action, x, buffers);
+                }
             }
             for r in 0..rows {
                 let scale = samples.mask[r * horizon + t] * scale;
@@ -80,8 +81,8 @@ impl<T: Element> DynamicsLoss<T> {
         let branches = Branches { trunk: Order::First, dynamics: Some(Order::First), policy: false };
         for (t, (step, state_hat)) in steps.iter_mut().zip(state_hat.chunks(rows * latent)).enumerate().rev() {
             add(x, state_hat);
-            if network.has_position_dynamics() {
-                network.position_hat((0..rows).map(|r| applied(t, r)), x, &mut gradient.position);
+            if let (Some(position), Some(gradient)) = (&network.position, &mut gradient.position) {
+                position.accumulate((0..rows).map(|r| applied(t, r)), x, gradient);
             } else {
                 let mut hat = Cotangents { x, x_g: x_g_hat, action };
                 network.double_backward(rows, branches, step, &mut hat, gradient, buffers);

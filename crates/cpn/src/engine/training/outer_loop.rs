@@ -108,10 +108,7 @@ impl<T: Element> OuterLoop<T> {
     pub fn run(&mut self, weights: &impl Weights<T>, samples: Samples<'_, T>) -> OuterGradient<T> {
         let network = PolicyDynamics::new(&self.config, weights);
         let (horizon, updates) = (self.config.horizon as usize, self.config.trained_updates() as usize);
-        debug_assert!(
-            updates == 0 || !network.has_position_dynamics(),
-            "their double backward pass is of the first order"
-        );
+        debug_assert!(updates == 0 || network.position.is_none(), "position dynamics are not trained through updates");
         let count: T = samples.mask.iter().copied().sum();
         let cloned_plans = if self.losses.every_update { updates + 1 } else { 1 };
         let settings = Settings {
