@@ -3,6 +3,7 @@
 # MuJoCo 3.3.0 ships no stubs for its compiled modules.
 # pyright: reportAttributeAccessIssue=false
 
+import atexit
 import copy
 from dataclasses import asdict
 from functools import cache
@@ -53,6 +54,12 @@ class Renderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._scene: Scene | None = None
         self._context: mujoco.MjrContext | None = None
+
+    def close(self) -> None:
+        """Frees the GL context; the renderer draws no more."""
+        if self._context is not None:
+            self._context.free()
+        self._gl.free()
 
     def spec(self, scene: Scene) -> RenderSpec:
         """Render spec of a scene's images."""
@@ -120,4 +127,7 @@ def process_renderer() -> Renderer:
         OpenGLError: If OpenGL is missing or does not draw.
         RuntimeError: If the process has made another.
     """
-    return Renderer()
+    renderer = Renderer()
+    # Its destructor would be too late: while the interpreter shuts down PyOpenGL fails to import, and logs that.
+    atexit.register(renderer.close)
+    return renderer

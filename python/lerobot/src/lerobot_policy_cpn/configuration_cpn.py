@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import NoReturn
 
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.utils.constants import OBS_IMAGE
+from lerobot.utils.constants import OBS_IMAGES
 
 UNTRAINABLE = "policy cpn: its models are trained by cpn-trainer and served by cpn-planner; here it has no weights"
 
@@ -19,15 +19,17 @@ class CpnConfig(PreTrainedConfig):
     model: str = "cpn"
     """Name of the planner's model."""
     goal: str = ""
-    """Image file of the finished task, for tasks without one in `goals`."""
+    """Image file of the finished task, for tasks without one in `goals`; if empty, the goal is observed."""
     goals: dict[str, str] = field(default_factory=dict)
     """Image file of the finished task, by the task's description as the environment gives it."""
     updates: int | None = None
     """Number of updates of a plan; the model's own if None."""
     seed: int = 0
     """Seed of the first plan of an episode; each step adds one."""
-    image_key: str = OBS_IMAGE
-    """Key of the camera image among the observations."""
+    image_key: str | None = None
+    """Key of the camera image among the observations; if None, that of the only image beside the goal."""
+    goal_key: str = f"{OBS_IMAGES}.goal"
+    """Key of the goal image among the observations, for tasks without an image file."""
     # A request is made of pixels on the host.
     device: str | None = "cpu"
 
@@ -54,12 +56,35 @@ class CpnConfig(PreTrainedConfig):
         """None, since the policy is not trained here."""
         return
 
-    def validate_features(self) -> None:
-        """Checks the observation.
+    @property
+    def camera_key(self) -> str:
+        """Key of the camera image among the input features.
 
         Raises:
-            ValueError: If there is no camera image `image_key` among the input features.
+            ValueError: If `image_key` is not among the input features, or is None and there is not exactly one choice.
         """
-        if self.image_key not in self.image_features:
-            expected = ", ".join(self.image_features) or "an environment or dataset with images"
-            raise ValueError(f"image_key: expected one of {expected}, got {self.image_key}")
+        keys = [key for key in self.image_features if key != self.goal_key]
+        if self.image_key is None and len(keys) == 1:
+            return keys[0]
+        if self.image_key in keys:
+            return self.image_key
+        expected = f"one of {', '.join(keys)}" if keys else "an environment or dataset with images"
+        raise ValueError(f"image_key: expected {expected}, got {self.image_key}")
+
+    @property
+    def observes_goal(self) -> bool:
+        """Whether the goal image is among the input features."""
+        return self.goal_key in self.image_features
+
+    def validate_features(self) -> None:
+        """Checks the observation and the goal.
+
+        Raises:
+            ValueError: If there is no camera image among the input features, or no goal image there nor in a file.
+        """
+        _ = self.camera_key
+        if not (self.goal or self.goals or self.observes_goal):
+            raise ValueError(
+                f"goal: expected an image file of the finished task, goals, or {self.goal_key} among the observations, "
+                "got none of them"
+            )

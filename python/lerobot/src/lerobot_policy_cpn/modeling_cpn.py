@@ -3,17 +3,21 @@
 from collections.abc import Sequence
 from typing import Any, NoReturn, cast
 
+import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from numpy.typing import NDArray
 from torch import Tensor
 
 import cpn_client
 from cpn_client import Episode, Image, Plan, Search
 from lerobot_policy_cpn.configuration_cpn import UNTRAINABLE, CpnConfig
 
+Pixels = NDArray[np.uint8]
+
 
 class CpnPolicy(PreTrainedPolicy):
-    """Policy of a remote planner, towards a goal image; without weights and gradients.
+    """Policy of a remote planner, towards a goal image, from a file or observed; without weights and gradients.
 
     Each environment of a batch has an episode of its own, from `reset` to `reset`; its plans come from one checkpoint.
     """
@@ -25,7 +29,7 @@ class CpnPolicy(PreTrainedPolicy):
         """Reads the goal images and connects to the planner.
 
         Raises:
-            ValueError: If there is no goal image or no camera image, or the address is malformed.
+            ValueError: If the configuration has no goal image or no camera image, or the address is malformed.
             OSError: If a goal image cannot be read.
             cpn_client.PlannerError: If the address leads to no planner.
         """
@@ -33,10 +37,10 @@ class CpnPolicy(PreTrainedPolicy):
         config.validate_features()
         self._goals = {task: Image.of(file, field="goals") for task, file in config.goals.items()}
         self._goal = Image.of(config.goal, field="goal") if config.goal else None
-        if not self._goals and self._goal is None:
-            raise ValueError("goal: expected an image file of the finished task, or goals, got neither")
         self._search = None if config.updates is None else Search(iterations=config.updates)
-        self._image_key, self._model, self._seed = config.image_key, config.model, config.seed
+        self._image_key = config.camera_key
+        self._goal_key = config.goal_key if config.observes_goal else None
+        self._model, self._seed = config.model, config.seed
         self._planner = cpn_client.connect(config.address)
         self.reset()
 
@@ -48,23 +52,25 @@ class CpnPolicy(PreTrainedPolicy):
         """Plans of a batch, float32 [B, horizon, A] in [-1, 1].
 
         Args:
-            batch: Camera images, [B, 3, height, width] in [0, 1], at `image_key`, and at `task` the B descriptions of
-                the tasks, without which all have the goal of the description "".
+            batch: Camera images, [B, 3, height, width] in [0, 1], at `image_key`; goal images of the same shape at
+                `goal_key`, which are read at the beginning of an episode and yield to image files; and at `task` the B
+                descriptions of the tasks, without which all have the image file of the description "".
 
         Raises:
             ValueError: If a task has no goal image, or the size of the batch changes within an episode.
             cpn_client.PlannerError: If the planner refuses the request, or is away.
         """
         images = batch[self._image_key]
-        tasks = batch.get("task") or [""] * len(images)
-        self._episodes = self._episodes or [self._episode(task) for task in tasks]
+        if not self._episodes:
+            tasks = batch.get("task") or [""] * len(images)
+            observed = _pixels(batch[self._goal_key]) if self._goal_key else [None] * len(images)
+            self._episodes = [self._episode(*goal) for goal in zip(tasks, observed, strict=True)]
         if len(images) != len(self._episodes):
             raise ValueError(
                 f"{self._image_key}: expected a batch of {len(self._episodes)}, as since the last reset, "
                 f"got one of {len(images)}"
             )
-        frames = (255 * images).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy(force=True)
-        plans = [_plan(episode, frame) for episode, frame in zip(self._episodes, frames, strict=True)]
+        plans = [_plan(episode, frame) for episode, frame in zip(self._episodes, _pixels(images), strict=True)]
         return torch.tensor(plans, dtype=torch.float32, device=images.device).clamp(-1, 1)
 
     def select_action(self, batch: dict[str, Any], **options: Any) -> Tensor:  # noqa: ANN401
@@ -79,14 +85,21 @@ class CpnPolicy(PreTrainedPolicy):
         """Raises `NotImplementedError`: the policy has no parameters."""
         raise NotImplementedError(UNTRAINABLE)
 
-    def _episode(self, task: str) -> Episode:
-        goal = self._goals.get(task, self._goal)
+    def _episode(self, task: str, observed: Pixels | None) -> Episode:
+        """Episode towards the task's image file, or else towards the observed goal."""
+        file = self._goals.get(task, self._goal)
+        goal = observed if file is None else file
         if goal is None:
             raise ValueError(f"goals: expected an image file for {task!r}, got those for {', '.join(self._goals)}")
         return self._planner.episode(goal, model=self._model, seed=self._seed, search=self._search)
 
 
-def _plan(episode: Episode, frame: Any) -> Sequence[Sequence[float]]:  # noqa: ANN401
+def _pixels(images: Tensor) -> Pixels:
+    """Pixels, uint8 [B, height, width, 3], of images, [B, 3, height, width] in [0, 1]."""
+    return (255 * images).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy(force=True)
+
+
+def _plan(episode: Episode, frame: Pixels) -> Sequence[Sequence[float]]:
     """Planned actions, [horizon, A], for a frame, uint8 [height, width, 3]."""
     episode.act(frame)
     return cast("Plan", episode.plan).actions
