@@ -40,6 +40,8 @@ NOISY_EPOCHS = {"training.epochs": 6}
 """As many updates of the weights as with twice the episodes and half the epochs."""
 AUGMENTED = {"training.goals": "hindsight", "training.shift_pixels": 4}
 POSITION_DYNAMICS = {"model.position_dynamics": "true", "model.updates": 5} | DYNAMICS | POSITION
+ACCURATE = {"training.losses.position": 30}
+"""Weight of the position loss by which positions in images of the development tasks are most accurate."""
 
 CONTROLS = ("no-op", "oracle")
 """Controls of the evaluator."""
@@ -81,13 +83,22 @@ ARMS = {
     "te-bc": Arm(method="te-bc"),
     "position-te-bc": Arm(POSITION, "te-bc"),
     "position-dynamics": Arm(POSITION_DYNAMICS, updates=(0, 1, 2, 5, 20)),
+    "accurate-position-dynamics": Arm(POSITION_DYNAMICS | ACCURATE, updates=(0, 1, 2, 5, 20)),
     "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISE),
     "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISE),
     "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
     "noise-augmented-paper": Arm(NOISY_EPOCHS | AUGMENTED, noise=NOISE),
     "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, noise=NOISE),
 } | {control: Arm(method=control) for control in CONTROLS}
-REPORTED_ARMS = {control: (0,) for control in CONTROLS} | {"te-bc": (0,), "position-te-bc": (0,), "paper": (1,), "position-dynamics": (0, 5)}
+REPORTED_ARMS = {
+    "no-op": (0,),
+    "oracle": (0,),
+    "te-bc": (0,),
+    "position-te-bc": (0,),
+    "paper": (1,),
+    "position-dynamics": (0, 5),
+    "accurate-position-dynamics": (0, 5),
+}
 """Arms that are run on the reported tasks, with their numbers of updates."""
 SEEDS = (0, 1)
 TRIALS = 20

@@ -1,9 +1,9 @@
 """Executes plans and baselines in the simulated arm, each on the same variations.
 
-Controllers: trajectories planned before the hand moves, by CPN, by CPN trained with goals in hindsight, by CPN with position
-dynamics, and by the policy of the latter, without updates; CPN planning anew at every step, with position dynamics and
-without; the recorded actions of the nearest demonstration; a straight line of the fingertip, by inverse kinematics. Models
-are named `cpn-<seed>`, `hindsight-<seed>` and `position-<seed>`.
+Controllers: trajectories planned before the hand moves, by CPN, by CPN trained with goals in hindsight, by CPN with
+position dynamics, and by the policy of the latter, without updates; CPN planning anew at every step, with position
+dynamics and without; the recorded actions of the nearest demonstration; a straight line of the fingertip, by inverse
+kinematics. Models are named `cpn-<seed>`, `hindsight-<seed>` and `position-<seed>`.
 
 Each trial is a line of `trials.jsonl` as soon as it is done; a second run executes the missing ones.
 """

@@ -91,9 +91,12 @@ class Planner:
         self._name = name
 
     def plan(self, model: str, hand: Array, goal: Array, updates: int | None = None) -> Array:
-        """The next actions of the hand towards the goal, [H, 3], clipped to [-1, 1]; with the model's own number of updates if
-        none is given."""
-        search = None if updates is None else planner_pb2.Search(iterations=updates)
+        """The next actions of the hand towards the goal, [H, 3], clipped to [-1, 1].
+
+        Without a number of updates it is the model's own.
+        """
+        gradient = planner_pb2.SOLVER_GRADIENT
+        search = None if updates is None else planner_pb2.Search(solver=gradient, iterations=updates)
         message = planner_pb2.PlanRequest(
             model=model, position=_point(hand), goal_position=_point(goal), search=search
         )

@@ -93,7 +93,7 @@ def table(rows: list[dict]) -> str:
         return f"{row[measure]['mean']:.2f} ({low:.2f} to {high:.2f})"
 
     lines = [
-        "| targets | method | predicted end, cm | executed end, cm | closest, cm | position dynamics minus this, cm | pokes |",
+        "| targets | method | predicted end, cm | executed end, cm | closest, cm | position minus this, cm | pokes |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
