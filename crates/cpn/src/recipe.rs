@@ -159,7 +159,7 @@ impl Preset {
                 Recipe {
                     model: ModelConfig { position_dynamics: true, updates: 5, ..model },
                     training: Training {
-                        losses: Losses { every_update: false, dynamics: 0.5, position: 0.3 },
+                        losses: Losses { every_update: false, dynamics: 0.5, position: 30.0 },
                         ..training
                     },
                 }
