@@ -7,15 +7,17 @@ goes on. Each run's outcomes are kept in docs/results/ablations, of which --tabl
 import argparse
 import json
 import os
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from dataset import DATASET, record
 from lab import ROOT, Lab, main, train
-from scipy.stats import binomtest
+from scipy.stats import binomtest, bootstrap
 
 RESULTS = ROOT / "docs/results/ablations"
 DEVELOPMENT = ("coffee-button", "dial-turn", "door-lock", "drawer-close", "handle-press", "handle-pull")
@@ -100,6 +102,8 @@ REPORTED_ARMS = {
     "accurate-position-dynamics": (0, 5),
 }
 """Arms that are run on the reported tasks, with their numbers of updates."""
+BEST = ("accurate-position-dynamics", "5")
+"""Arm and number of updates that the others are compared with."""
 SEEDS = (0, 1)
 TRIALS = 20
 
@@ -192,14 +196,9 @@ def reported_table() -> str:
     Groups and training seeds are pooled, so that the intervals leave out the differences between seeds; cells that were
     not run are missing.
     """
-    arms: dict[tuple[str, str], dict[str, list[int]]] = {}
-    for arm, group, seed in product(REPORTED_ARMS, REPORTED, SEEDS):
-        for updates, by_task in Cell(group, arm, seed).outcomes().items():
-            row = arms.setdefault((arm, updates), {})
-            for task, outcomes in by_task.items():
-                row.setdefault(task, []).extend(outcomes)
+    arms = _reported(SEEDS)
     tasks = [task for group in REPORTED.values() for task in group]
-    names = [f"{arm}, U = {updates}" if ARMS[arm].plans else arm for arm, updates in arms]
+    names = [_name(*column) for column in arms]
     lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
     for task in tasks:
         counts = [_count(row, (task,)) if task in row else None for row in arms.values()]
@@ -210,6 +209,45 @@ def reported_table() -> str:
     percent = [f"{100 * interval.low:.0f} to {100 * interval.high:.0f}" for interval in intervals]
     lines.append("| 95 %, in per cent | " + " | ".join(percent) + " |")
     return "\n".join(lines)
+
+
+def differences() -> str:
+    """Paired differences of the success rate on the reported tasks between `BEST` and the other columns, in Markdown.
+
+    They are of the first training seed. Pairs are of the same variation; the intervals are bootstrapped over tasks.
+    """
+    columns = _reported(SEEDS[:1])
+    best = columns.pop(BEST, None)
+    lines = [
+        f"| {_name(*BEST)} against | difference | 95 %, over tasks | it alone | the other alone |",
+        "|---" * 5 + "|",
+    ]
+    for column, other in columns.items():
+        if best is None or best.keys() != other.keys():
+            continue
+        pairs = [np.array([best[task], other[task]]) for task in best]
+        by_task = np.array([np.mean(mine - others) for mine, others in pairs])
+        interval = bootstrap((by_task,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+        alone = [sum(int(np.sum(pair[i] > pair[1 - i])) for pair in pairs) for i in (0, 1)]
+        percent = [f"{100 * value:+.0f} %" for value in (by_task.mean(), interval.low, interval.high)]
+        lines.append(f"| {_name(*column)} | {percent[0]} | {percent[1]} to {percent[2]} | {alone[0]} | {alone[1]} |")
+    return "\n".join(lines)
+
+
+def _reported(seeds: Iterable[int]) -> dict[tuple[str, str], dict[str, list[int]]]:
+    """Outcomes on the reported tasks by arm and number of updates, and by task."""
+    columns: dict[tuple[str, str], dict[str, list[int]]] = {}
+    for arm, group, seed in product(REPORTED_ARMS, REPORTED, seeds):
+        for updates, by_task in Cell(group, arm, seed).outcomes().items():
+            row = columns.setdefault((arm, updates), {})
+            for task, outcomes in by_task.items():
+                row.setdefault(task, []).extend(outcomes)
+    return columns
+
+
+def _name(arm: str, updates: str) -> str:
+    """Heading of a column."""
+    return f"{arm}, U = {updates}" if ARMS[arm].plans else arm
 
 
 def _count(by_task: dict[str, list[int]], tasks: tuple[str, ...]) -> tuple[int, int]:
@@ -247,7 +285,7 @@ def ablations() -> None:
         with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             for _ in pool.map(run, cells):
                 pass
-    print(development_table(), reported_table(), sep="\n\n")
+    print(development_table(), reported_table(), differences(), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -97,9 +97,7 @@ class Planner:
         """
         gradient = planner_pb2.SOLVER_GRADIENT
         search = None if updates is None else planner_pb2.Search(solver=gradient, iterations=updates)
-        message = planner_pb2.PlanRequest(
-            model=model, position=_point(hand), goal_position=_point(goal), search=search
-        )
+        message = planner_pb2.PlanRequest(model=model, position=_point(hand), goal_position=_point(goal), search=search)
         response = request(self._session, keys.planner_plan(self._name), message, planner_pb2.PlanResponse)
         return np.clip([action.values for action in response.actions], -1, 1)
 
