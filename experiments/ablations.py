@@ -45,6 +45,7 @@ POSITION_DYNAMICS = {"model.position_dynamics": "true", "model.updates": 5} | DY
 ACCURATE = {"training.losses.position": 30}
 """Weight of the position loss by which positions in images of the development tasks are most accurate."""
 
+DEFAULT = "default"
 CONTROLS = ("no-op", "oracle")
 """Controls of the evaluator."""
 
@@ -58,8 +59,8 @@ class Arm:
     method: str = "cpn"
     noise: float = 0
     """Noise injection of the demonstrations."""
-    updates: tuple[int, ...] = (0, 1, 5)
-    """Numbers of updates to plan with, of a method that plans."""
+    updates: tuple[int | str, ...] = (0, 1, 5)
+    """Numbers of updates to plan with, of a method that plans; `DEFAULT` for the planner's choice."""
 
     @property
     def dataset(self) -> Path:
@@ -86,6 +87,7 @@ ARMS = {
     "position-te-bc": Arm(POSITION, "te-bc"),
     "position-dynamics": Arm(POSITION_DYNAMICS, updates=(0, 1, 2, 5, 20)),
     "accurate-position-dynamics": Arm(POSITION_DYNAMICS | ACCURATE, updates=(0, 1, 2, 5, 20)),
+    "familiar-goals": Arm(POSITION_DYNAMICS | ACCURATE | {"model.familiar_goals": 1024}, updates=(DEFAULT,)),
     "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISE),
     "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISE),
     "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
@@ -131,7 +133,7 @@ class Cell:
         return GROUPS[self.group] + (TRAINED if self.group == "development" else ())
 
     @property
-    def updates(self) -> tuple[int, ...]:
+    def updates(self) -> tuple[int | str, ...]:
         """Numbers of updates to plan with; 0 alone for a method that does not plan."""
         if self.group != "development":
             return REPORTED_ARMS[self.arm]
@@ -158,7 +160,7 @@ def run(cell: Cell) -> None:
         lab.worker("w0")
         search = ["--models", recipe.method, "--tasks", ",".join(cell.tasks), "--trials", str(TRIALS)]
         for updates in cell.updates:
-            choice = ["--updates", str(updates)] if recipe.plans else []
+            choice = ["--updates", str(updates)] if recipe.plans and updates != DEFAULT else []
             lab.evaluate(*search, *choice, "--out", str(out / f"updates-{updates}"))
     keep(cell, out)
 
