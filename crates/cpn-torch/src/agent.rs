@@ -21,7 +21,7 @@ pub struct Agent {
 impl Agent {
     /// The agent of a valid model on a device.
     pub fn new(model: &Model, device: Device) -> Self {
-        let Model { config, weights } = model;
+        let Model { config, weights, .. } = model;
         let variables = nn::VarStore::new(device);
         let root = variables.root();
         let agent = Self {

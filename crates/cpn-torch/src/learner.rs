@@ -128,7 +128,7 @@ impl Learner for TorchLearner {
 
     fn model(&self) -> Model {
         let weights = self.by_name(&self.values).map(|(name, weight)| (name.clone(), weight)).collect();
-        Model { config: self.agent.config().clone(), weights }
+        Model { config: self.agent.config().clone(), weights, familiar: None }
     }
 
     fn state(&self) -> Tensors {

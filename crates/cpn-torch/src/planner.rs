@@ -5,7 +5,7 @@ use crate::tensors;
 use cpn::method::{Observed, Ongoing, Plan, Query, Search};
 use cpn::search::Searcher;
 use cpn::search::block::{Actions, PlanBlock, Purpose};
-use cpn::{Input, Method, Model, ModelConfig};
+use cpn::{FamiliarGoals, Input, Method, Model, ModelConfig};
 use tch::{Device, Kind, Tensor};
 
 /// R on the processor. Smaller batches are padded: at the paper's sizes a plan then does not depend on the rest of the batch, at others
@@ -18,6 +18,7 @@ const CUDA_ROWS: usize = 256;
 #[derive(Debug)]
 pub struct TorchPlanner {
     config: ModelConfig,
+    familiar: Option<FamiliarGoals>,
     searcher: Searcher<TorchBlock>,
 }
 
@@ -46,7 +47,7 @@ impl TorchPlanner {
         let capacity = if device.is_cuda() { CUDA_ROWS } else { CPU_ROWS };
         let actions = vec![0.0; capacity * (config.horizon * config.actions) as usize];
         let block = TorchBlock { agent, device, threads, capacity, actions, rollout: None, resident: None };
-        Self { config, searcher: Searcher::new(vec![block]) }
+        Self { config, familiar: model.familiar.clone(), searcher: Searcher::new(vec![block]) }
     }
 }
 
@@ -78,6 +79,10 @@ impl Method for TorchPlanner {
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>> {
         let block = &self.searcher.blocks_mut()[0];
         inputs.chunks(block.capacity).flat_map(|inputs| block.encode(inputs)).collect()
+    }
+
+    fn is_familiar(&self, x_g: &[f32]) -> bool {
+        self.familiar.as_ref().is_some_and(|familiar| familiar.contains(x_g))
     }
 
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {

@@ -2,6 +2,7 @@
 
 use crate::archive::{self, ArchiveError, Tensors};
 use crate::config::{ConfigError, ModelConfig};
+use crate::familiar::FamiliarGoals;
 use crate::model::{self, Model, Parameter};
 use crate::recipe::Training;
 use crate::unique;
@@ -41,7 +42,7 @@ struct Metadata {
 /// A checkpoint that was read: a model with its provenance and digests.
 #[derive(Debug)]
 pub struct Checkpoint {
-    /// Configuration and weights.
+    /// Configuration, weights and familiar goals.
     pub model: Model,
     /// Provenance of the model.
     pub provenance: Provenance,
@@ -64,7 +65,9 @@ impl Checkpoint {
 /// If the metadata cannot be represented as JSON, or the weights as safetensors.
 pub fn to_bytes(model: &Model, provenance: &Provenance) -> Result<Vec<u8>, ArchiveError> {
     let metadata = Metadata { format: FORMAT, model: model.config.clone(), provenance: provenance.clone() };
-    archive::to_bytes(&model.weights, &metadata)
+    let mut tensors = model.weights.clone();
+    tensors.extend(model.familiar.iter().flat_map(FamiliarGoals::tensors));
+    archive::to_bytes(&tensors, &metadata)
 }
 
 /// Reads and validates a checkpoint; the bytes need not be trusted.
@@ -78,7 +81,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     }
 
     // The version first: metadata of other versions have other fields.
-    let (tensors, document): (_, Value) = archive::from_bytes(bytes)?;
+    let (mut tensors, document): (_, Value) = archive::from_bytes(bytes)?;
     if document["format"] != FORMAT {
         let got = document["format"].as_u64().map_or_else(|| "no number".to_owned(), |format| format.to_string());
         return Err(CheckpointError::Format { got });
@@ -92,8 +95,9 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     }
 
     let config = serde_json::to_vec(&metadata.model).map_err(CheckpointError::Metadata)?;
-    check_weights(&tensors, &metadata.model)?;
-    let model = Model { config: metadata.model, weights: tensors };
+    check_tensors(&tensors, &metadata.model)?;
+    let familiar = FamiliarGoals::take(&mut tensors);
+    let model = Model { config: metadata.model, weights: tensors, familiar };
     let (digest, config_digest) = (digest(bytes), digest(&config));
     Ok(Checkpoint { model, provenance: metadata.provenance, digest, config_digest })
 }
@@ -103,15 +107,16 @@ pub fn digest(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// Checks that tensors are the weights of a valid configuration, exactly in name, shape and type, and finite.
-fn check_weights(tensors: &Tensors, config: &ModelConfig) -> Result<(), CheckpointError> {
-    let parameters = model::parameters(config);
-    let is_known = |name: &String| parameters.iter().any(|parameter| parameter.name == *name);
+/// Checks that tensors are the weights and the familiar goals of a valid configuration, exactly in name, shape and type, and finite.
+fn check_tensors(tensors: &Tensors, config: &ModelConfig) -> Result<(), CheckpointError> {
+    let weights = model::parameters(config).into_iter().map(|Parameter { name, shape, .. }| (name, shape));
+    let expected: Vec<_> = weights.chain(FamiliarGoals::shapes(config)).collect();
+    let is_known = |name: &String| expected.iter().any(|(known, _)| known == name);
     if let Some(name) = tensors.keys().find(|name| !is_known(name)) {
         return Err(CheckpointError::UnknownTensor { name: name.clone() });
     }
 
-    for Parameter { name, shape, .. } in parameters {
+    for (name, shape) in expected {
         let Some(tensor) = tensors.get(&name) else { return Err(CheckpointError::MissingTensor { name }) };
         match tensor.elements::<f32>().filter(|_| tensor.shape() == shape) {
             Some(elements) if elements.iter().all(|element| element.is_finite()) => {}
@@ -152,10 +157,10 @@ pub enum CheckpointError {
     /// A configuration out of range.
     #[error("checkpoint model: {0}")]
     Config(#[from] ConfigError),
-    /// A weight of the configuration that is missing in the file.
+    /// A tensor of the configuration that is missing in the file.
     #[error("checkpoint tensor \"{name}\": expected by the model's configuration, got none")]
     MissingTensor {
-        /// The weight's name.
+        /// The tensor's name.
         name: String,
     },
     /// A tensor in the file that is not part of the configuration.
@@ -164,20 +169,20 @@ pub enum CheckpointError {
         /// The tensor's name.
         name: String,
     },
-    /// A weight of another shape or type.
+    /// A tensor of another shape or type.
     #[error("checkpoint tensor \"{name}\": expected {expected}, got {got}")]
     Shape {
-        /// The weight's name.
+        /// The tensor's name.
         name: String,
         /// Type and shape by the configuration.
         expected: String,
         /// Type and shape in the file.
         got: String,
     },
-    /// A weight that is NaN or infinite.
+    /// A tensor with NaN or infinity.
     #[error("checkpoint tensor \"{name}\": expected finite values, got NaN or infinity")]
     NotFinite {
-        /// The weight's name.
+        /// The tensor's name.
         name: String,
     },
 }

@@ -243,14 +243,31 @@ pub struct ModelConfig {
     /// own, and the inner loss compares them alone. Training clones the policy's plan, before any update.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub position_dynamics: bool,
+    /// N, the number of training goals whose embeddings are stored, to recognise goals of trained tasks; a training run on fewer
+    /// episodes stores as many. 0 for none, and for methods that do not plan.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub familiar_goals: i64,
+}
+
+fn is_zero(number: &i64) -> bool {
+    *number == 0
 }
 
 impl ModelConfig {
     /// The paper's values: layers of width 32, 4 actions, H = 5, U = 1.
     pub fn paper(method: MethodKind) -> Self {
         let (horizon, updates) = if method.plans() { (5, 1) } else { (1, 0) };
-        let (encoder, position_dynamics) = (EncoderConfig::paper(), false);
-        Self { method, encoder, hidden: 32, gate_hidden: 32, actions: 4, horizon, updates, position_dynamics }
+        Self {
+            method,
+            encoder: EncoderConfig::paper(),
+            hidden: 32,
+            gate_hidden: 32,
+            actions: 4,
+            horizon,
+            updates,
+            position_dynamics: false,
+            familiar_goals: 0,
+        }
     }
 
     /// Number of elements of a state, from the first on, that the inner loss and the dynamics loss compare.
@@ -285,11 +302,13 @@ impl ModelConfig {
         }
         if self.method.plans() {
             in_range("horizon", self.horizon, 1, 64)?;
-            in_range("updates", self.updates, 0, 64)
+            in_range("updates", self.updates, 0, 64)?;
+            in_range("familiar_goals", self.familiar_goals, 0, 4096)
         } else {
             in_range("horizon", self.horizon, 1, 1)?;
             in_range("updates", self.updates, 0, 0)?;
-            in_range("position_dynamics", self.position_dynamics.into(), 0, 0)
+            in_range("position_dynamics", self.position_dynamics.into(), 0, 0)?;
+            in_range("familiar_goals", self.familiar_goals, 0, 0)
         }
     }
 }

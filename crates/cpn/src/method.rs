@@ -37,6 +37,12 @@ pub trait Method: Send {
     /// does not depend on the rest of the batch.
     fn encode(&mut self, inputs: &[Observed<'_>]) -> Vec<Vec<f32>>;
 
+    /// True if a goal's embedding, `[Z]`, is near that of a training goal, so that the policy's plan is expected to be better without
+    /// updates.
+    fn is_familiar(&self, _x_g: &[f32]) -> bool {
+        false
+    }
+
     /// A plan for each query, all by the same search. A plan does not depend on the rest of the batch: in
     /// any bit natively, within rounding by libtorch.
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;

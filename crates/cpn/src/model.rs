@@ -2,6 +2,7 @@
 
 use crate::archive::{Tensor, Tensors};
 use crate::config::{EncoderConfig, ImageEncoderConfig, ModelConfig, PositionEncoderConfig};
+use crate::familiar::FamiliarGoals;
 use crate::{images, positions};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -20,6 +21,8 @@ pub struct Model {
     pub config: ModelConfig,
     /// Weights by their names in a checkpoint, float32, in the shapes of [`parameters`].
     pub weights: Tensors,
+    /// Goals of the training episodes; `None` before the end of training, and if the configuration stores none.
+    pub familiar: Option<FamiliarGoals>,
 }
 
 /// A weight of a model.
@@ -58,7 +61,7 @@ impl Model {
             (name, Tensor::new(&shape, &elements))
         };
         let weights = parameters(&config).into_iter().map(&mut weight).collect();
-        Self { config, weights }
+        Self { config, weights, familiar: None }
     }
 
     /// Sets α of position dynamics, which are not trained through updates, to 2 / (H ‖W‖²), W being the motion of the position by an
@@ -72,6 +75,14 @@ impl Model {
         let norm_squared: f32 = motion.iter().map(|element| element * element).sum();
         let step_size = 2.0 / (self.config.horizon as f32 * norm_squared.max(f32::EPSILON));
         self.weights.insert("step_size".to_owned(), Tensor::new(&[], &[step_size]));
+    }
+
+    /// Stores the configured number of the training episodes' goals, given as embeddings by the trained encoder, `[Z]` each. With fewer
+    /// episodes the configuration has their number from then on.
+    pub fn set_familiar_goals(&mut self, embeddings: &[Vec<f32>]) {
+        let familiar = FamiliarGoals::new(embeddings, self.config.familiar_goals as usize);
+        self.config.familiar_goals = familiar.count() as i64;
+        self.familiar = Some(familiar);
     }
 }
 

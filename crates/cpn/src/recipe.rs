@@ -89,7 +89,7 @@ pub enum Preset {
     /// Contextual planning network with our faster training: a tenth of the epochs, shared goals, and bfloat16.
     Cpn,
     /// As `cpn`, with position dynamics: five updates lead the hand to its position in the goal picture, for tasks without
-    /// demonstrations.
+    /// demonstrations. Familiar goals keep the policy's plan, for trained tasks.
     CpnPosition,
     /// Contextual planning network of positions in the Jenga scene (section "JENGA domain on a physical robot").
     Jenga,
@@ -157,7 +157,7 @@ impl Preset {
             Self::CpnPosition => {
                 let Recipe { model, training } = Self::Cpn.recipe();
                 Recipe {
-                    model: ModelConfig { position_dynamics: true, updates: 5, ..model },
+                    model: ModelConfig { position_dynamics: true, updates: 5, familiar_goals: 1024, ..model },
                     training: Training {
                         losses: Losses { every_update: false, dynamics: 0.5, position: 30.0 },
                         ..training
@@ -304,5 +304,14 @@ mod tests {
 
         let policy = ModelConfig { position_dynamics: true, ..ModelConfig::paper(MethodKind::TeBc) };
         assert_eq!(policy.validate().map_err(|error| error.field), Err("position_dynamics"));
+    }
+
+    #[test]
+    fn familiar_goals_are_bounded_and_need_a_method_that_plans() {
+        let with = |method, familiar_goals| ModelConfig { familiar_goals, ..ModelConfig::paper(method) }.validate();
+        assert!(with(MethodKind::Upn, 4096).is_ok());
+        for (method, count) in [(MethodKind::Upn, 4097), (MethodKind::Upn, -1), (MethodKind::TeBc, 1)] {
+            assert_eq!(with(method, count).map_err(|error| error.field), Err("familiar_goals"));
+        }
     }
 }

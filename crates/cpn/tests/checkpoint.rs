@@ -4,7 +4,7 @@
 
 use cpn::archive::{self, Tensor, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{MethodKind, Model};
+use cpn::{MethodKind, Model, ModelConfig};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use testing::{position_config, small_config};
@@ -25,7 +25,11 @@ fn saved() -> Vec<u8> {
 
 /// Message of the refusal of a checkpoint after `spoil`.
 fn refusal(spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
-    let (mut tensors, mut metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
+    refusal_of(&saved(), spoil)
+}
+
+fn refusal_of(bytes: &[u8], spoil: impl FnOnce(&mut Tensors, &mut Value)) -> String {
+    let (mut tensors, mut metadata): (Tensors, Value) = archive::from_bytes(bytes).unwrap();
     spoil(&mut tensors, &mut metadata);
     checkpoint::from_bytes(&archive::to_bytes(&tensors, &metadata).unwrap()).unwrap_err().to_string()
 }
@@ -42,6 +46,46 @@ fn a_checkpoint_round_trips() {
         assert_eq!(loaded.digest, checkpoint::digest(&bytes));
         assert_eq!(loaded.parents(), ["d"]);
     }
+}
+
+/// A model with two familiar goals, `[6]` each.
+fn with_familiar_goals() -> Model {
+    let config = ModelConfig { familiar_goals: 1024, ..small_config(MethodKind::Upn) };
+    let mut model = Model::new(config, 5);
+    model.set_familiar_goals(&[vec![0.0; 6], vec![1.0; 6]]);
+    model
+}
+
+#[test]
+fn familiar_goals_round_trip_and_others_leave_no_trace() {
+    let model = with_familiar_goals();
+    assert_eq!(model.config.familiar_goals, 2);
+    let bytes = checkpoint::to_bytes(&model, &provenance()).unwrap();
+    let loaded = checkpoint::from_bytes(&bytes).unwrap().model;
+    assert_eq!(loaded, model);
+    assert_eq!(checkpoint::to_bytes(&loaded, &provenance()).unwrap(), bytes);
+
+    let (tensors, metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
+    assert!(!tensors.keys().any(|name| name.contains("familiar")) && !metadata.to_string().contains("familiar"));
+}
+
+#[test]
+fn familiar_goals_that_do_not_fit_the_configuration_are_refused() {
+    let bytes = checkpoint::to_bytes(&with_familiar_goals(), &provenance()).unwrap();
+    let count = |count: i64| refusal_of(&bytes, |_, metadata| metadata["model"]["familiar_goals"] = json!(count));
+    assert_eq!(count(3), "checkpoint tensor \"familiar.goals\": expected F32[3, 6], got F32[2, 6]");
+    assert_eq!(count(0), "checkpoint tensor \"familiar.distance\": not part of the model's configuration");
+    assert_eq!(count(4097), "checkpoint model: familiar_goals: expected 0 to 4096, got 4097");
+    let message = refusal_of(&bytes, |tensors, _| drop(tensors.remove("familiar.distance")));
+    assert_eq!(message, "checkpoint tensor \"familiar.distance\": expected by the model's configuration, got none");
+    let infinite = Tensor::new(&[], &[f32::INFINITY]);
+    let message = refusal_of(&bytes, |tensors, _| drop(tensors.insert("familiar.distance".into(), infinite)));
+    assert_eq!(message, "checkpoint tensor \"familiar.distance\": expected finite values, got NaN or infinity");
+    let message = refusal_of(&bytes, |_, metadata| {
+        let model = &mut metadata["model"];
+        (model["method"], model["horizon"], model["updates"]) = (json!("bc"), json!(1), json!(0));
+    });
+    assert_eq!(message, "checkpoint model: familiar_goals: expected 0 to 0, got 2");
 }
 
 #[test]

@@ -102,7 +102,7 @@ fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: 
     let bytes = |name: &str| tensors[name].elements::<u8>().unwrap();
     let (frames, goals) = (bytes("frames"), bytes("goals"));
     let weights = tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t)));
-    let model = Model { config, weights: weights.collect() };
+    let model = Model { config, weights: weights.collect(), familiar: None };
     let precision = if bfloat16 { Precision::Bfloat16.where_faster() } else { Precision::Float32 };
 
     let engine = engines::build(Some(engine), device, threads).unwrap();
@@ -117,7 +117,8 @@ fn plan(path: &PathBuf, &Args { batch, engine, device, threads, bfloat16, .. }: 
         let xs = planner.encode(&indices.iter().map(|index| frames[*index]).collect::<Vec<_>>());
         let encoded = Instant::now();
         let ends = xs.iter().zip(indices.iter().map(|index| &x_gs[*index]));
-        let queries: Vec<_> = ends.map(|(x, x_g)| Query { x, x_g, steps_left: 1, seed: 0, start: &[] }).collect();
+        let queries: Vec<_> =
+            ends.map(|(x, x_g)| Query { x, x_g, steps_left: 1, seed: 0, start: &[], keep_initial: false }).collect();
         let iterations = Iterations::Fixed(model.config.updates as usize);
         let plans = planner.plan(&queries, &mut Search { solver: Solver::Gradient, iterations });
         encoding += (encoded - started).as_secs_f64();

@@ -38,7 +38,7 @@ pub struct PlanRequest {
     pub deadline: Option<Duration>,
     /// SHA-256 of the required checkpoint, in hex; any checkpoint if none.
     pub model_digest: Option<String>,
-    /// Search for the actions; the model's default if none.
+    /// Search for the actions; the model's default if none: its updates, or the policy's plan for a familiar goal.
     pub search: Option<Search>,
     /// Initial plan of the search, `[horizon, actions]`; the policy's plan if empty.
     pub warm_start: Vec<Vec<f32>>,

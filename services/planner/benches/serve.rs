@@ -149,7 +149,10 @@ fn batches(models: &Path, batch: usize, duration: Duration) -> Value {
     while started.elapsed() < duration {
         let begun = Instant::now();
         let xs = planner.encode(&frames.iter().map(|frame| Observed::Image(frame.data())).collect::<Vec<_>>());
-        let queries: Vec<_> = xs.iter().map(|x| Query { x, x_g: &x_g, steps_left: 1, seed: 0, start: &[] }).collect();
+        let queries: Vec<_> = xs
+            .iter()
+            .map(|x| Query { x, x_g: &x_g, steps_left: 1, seed: 0, start: &[], keep_initial: false })
+            .collect();
         let iterations = Iterations::Fixed(updates);
         planner.plan(&queries, &mut cpn::method::Search { solver: Solver::Gradient, iterations });
         took.push((begun.elapsed().as_secs_f64(), begun.elapsed().as_secs_f64()));

@@ -128,7 +128,7 @@ impl Model {
         let ends = self.method.encode(&ends);
         self.costs.record_embedding(2, started.elapsed());
 
-        let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[] };
+        let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[], keep_initial: false };
         let updates = self.method.updates();
         let trials = updates.map(|_| (Solver::Cem(WARM_UP_SAMPLES), 1));
         let plans = [Some((Solver::Gradient, updates.unwrap_or_default())), trials];

@@ -6,7 +6,7 @@ use crate::model::Model;
 use crate::model_thread::Job;
 use crate::searches::Searches;
 use crate::served::Served;
-use crate::task::{Accepted, Answer, PlanTask, Reply, Waiting, deadline_exceeded};
+use crate::task::{Accepted, Answer, GoalEmbedding, Latents, PlanTask, Reply, Waiting, deadline_exceeded};
 use cpn::method::rollouts;
 use lru::LruCache;
 use metrics::{counter, histogram};
@@ -307,10 +307,10 @@ impl Owner {
 }
 
 /// LRU cache of goal embeddings, by goal id and checkpoint digest.
-type Embeddings = LruCache<(String, String), Vec<f32>>;
+type Embeddings = LruCache<(String, String), GoalEmbedding>;
 
-/// Embeds all observations, and the goals that are not cached; returns (x, x_g) of each task.
-fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -> Vec<(Vec<f32>, Vec<f32>)> {
+/// Embeds all observations, and the goals that are not cached.
+fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -> Vec<Latents> {
     let _spans: Vec<_> = tasks.iter().map(|task| debug_span!(parent: &task.span, "encode")).collect();
     let key = |task: &PlanTask| (task.goal_id.clone(), model.info.digest.clone());
     let known: Vec<_> = tasks.iter().map(|task| embeddings.get(&key(task)).cloned()).collect();
@@ -318,10 +318,11 @@ fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -
     let keys: Vec<_> = tasks.iter().map(|task| key(task)).collect();
     let inputs: Vec<_> = tasks.iter().map(|task| &task.observation).chain(unknown).collect();
     let mut xs = model.encode(&inputs);
-    let mut new = xs.split_off(tasks.len()).into_iter();
-    let x_gs: Vec<_> = known.into_iter().map(|known| known.or_else(|| new.next()).unwrap_or_default()).collect();
-    keys.into_iter().zip(&x_gs).for_each(|(key, x_g)| drop(embeddings.put(key, x_g.clone())));
-    xs.into_iter().zip(x_gs).collect()
+    let new = xs.split_off(tasks.len()).into_iter();
+    let mut new = new.map(|x_g| GoalEmbedding { is_familiar: model.method.is_familiar(&x_g), x_g });
+    let goals: Vec<_> = known.into_iter().map(|known| known.or_else(|| new.next()).unwrap_or_default()).collect();
+    keys.into_iter().zip(&goals).for_each(|(key, goal)| drop(embeddings.put(key, goal.clone())));
+    xs.into_iter().zip(goals).collect()
 }
 
 /// Records metrics of an answer: the count, and the time of each stage.

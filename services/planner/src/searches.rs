@@ -2,7 +2,7 @@
 
 use crate::load::{Load, SLICE};
 use crate::served::Shared;
-use crate::task::{Accepted, Answer, deadline_exceeded, shutting_down};
+use crate::task::{Accepted, Answer, Latents, deadline_exceeded, shutting_down};
 use cpn::method::{Ongoing, Query};
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -22,8 +22,8 @@ pub(crate) struct Searches {
 /// Sliced search of a batch: several tasks by gradient, or a single one.
 pub(crate) struct SlicedSearch {
     tasks: Vec<Accepted>,
-    /// Latents (x, x_g) of each task.
-    latents: Vec<(Vec<f32>, Vec<f32>)>,
+    /// Embeddings of each task.
+    latents: Vec<Latents>,
     /// Model at the search's begin, kept across swaps.
     model: Shared,
     ongoing: Ongoing,
@@ -46,13 +46,7 @@ impl Searches {
     }
 
     /// Begins the search of a batch of embedded tasks.
-    pub(crate) fn begin(
-        &mut self,
-        model: &Shared,
-        tasks: Vec<Accepted>,
-        latents: Vec<(Vec<f32>, Vec<f32>)>,
-        encoded: Duration,
-    ) {
+    pub(crate) fn begin(&mut self, model: &Shared, tasks: Vec<Accepted>, latents: Vec<Latents>, encoded: Duration) {
         let spans = tasks.iter().map(|accepted| debug_span!(parent: &accepted.task.span, "search")).collect();
         let (model, ongoing) = (model.clone(), model.model().begin(tasks[0].task.search));
         self.waiting.push_back(SlicedSearch {
@@ -175,6 +169,6 @@ impl SlicedSearch {
 }
 
 /// Queries of the tasks, for the method.
-fn queries<'a>(tasks: &'a [Accepted], latents: &'a [(Vec<f32>, Vec<f32>)]) -> Vec<Query<'a>> {
+fn queries<'a>(tasks: &'a [Accepted], latents: &'a [Latents]) -> Vec<Query<'a>> {
     tasks.iter().zip(latents).map(|(Accepted { task, .. }, latents)| task.query(latents)).collect()
 }

@@ -67,12 +67,31 @@ pub(crate) enum Reply {
     Callback(Box<dyn FnOnce(Answer) + Send>, Outbox),
 }
 
+/// Embedding of a goal by a checkpoint.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct GoalEmbedding {
+    /// x_g, `[Z]`.
+    pub(crate) x_g: Vec<f32>,
+    /// Whether the checkpoint was trained on goals like it.
+    pub(crate) is_familiar: bool,
+}
+
+/// Embeddings of a task's observation, `[Z]`, and goal.
+pub(crate) type Latents = (Vec<f32>, GoalEmbedding);
+
 impl PlanTask {
-    /// Query of the task, from the embeddings of its observation and goal.
-    pub(crate) fn query<'a>(&'a self, (x, x_g): &'a (Vec<f32>, Vec<f32>)) -> Query<'a> {
-        // Checked for methods that take it.
-        let steps_left = self.steps_left.unwrap_or_default();
-        Query { x, x_g, steps_left, seed: self.seed, start: &self.warm_start }
+    /// Query of the task, from its embeddings. For a familiar goal the policy's plan is kept, unless the request names a search or an
+    /// initial plan.
+    pub(crate) fn query<'a>(&'a self, (x, goal): &'a Latents) -> Query<'a> {
+        Query {
+            x,
+            x_g: &goal.x_g,
+            // Checked for methods that take it.
+            steps_left: self.steps_left.unwrap_or_default(),
+            seed: self.seed,
+            start: &self.warm_start,
+            keep_initial: goal.is_familiar && self.search.is_none() && self.warm_start.is_empty(),
+        }
     }
 
     /// Whether both tasks fit in one batch: same model, checkpoint, search and kind of start.

@@ -142,7 +142,7 @@ fn train(path: &Path, args: &Args) {
         tensors.into_iter().filter_map(|(name, t)| Some((name.strip_prefix("weight.")?.to_owned(), t))).collect();
     let learner = |precision| {
         let training = Training { precision, ..recipe.training.clone() };
-        let model = Model { config: recipe.model.clone(), weights: weights.clone() };
+        let model = Model { config: recipe.model.clone(), weights: weights.clone(), familiar: None };
         engine.learner(model, &training).unwrap()
     };
     let dataset = Dataset::load(&recordings(path), &[], Input::Image).unwrap();

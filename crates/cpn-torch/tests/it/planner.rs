@@ -64,7 +64,7 @@ fn steps_left(rows: usize) -> impl Iterator<Item = u32> {
 
 fn queries<'a>(x: &'a [Vec<f32>], x_g: &'a [Vec<f32>], start: &'a [Vec<f32>]) -> Vec<Query<'a>> {
     let rows = x.iter().zip(x_g).zip(steps_left(x.len())).zip(0..);
-    rows.map(|(((x, x_g), steps_left), seed)| Query { x, x_g, steps_left, seed, start }).collect()
+    rows.map(|(((x, x_g), steps_left), seed)| Query { x, x_g, steps_left, seed, start, keep_initial: false }).collect()
 }
 
 fn fixed<'a>(solver: Solver, count: usize) -> Search<'a> {
@@ -265,6 +265,42 @@ fn a_plan_does_not_depend_on_the_rest_of_its_batch() {
     }
 }
 
+/// In the same batch a familiar goal keeps the policy's plan, and another gets updates: bit for bit as alone, in any number of pieces.
+#[test]
+fn a_familiar_goal_keeps_the_initial_plan_of_its_row() {
+    for position_dynamics in [false, true] {
+        let paper = ModelConfig::paper(MethodKind::Cpn);
+        let config = ModelConfig { updates: 2, position_dynamics, familiar_goals: 1, ..paper };
+        let latent = config.encoder.latent();
+        let ((x, _), (x_g, _)) = (embeddings(2, latent, 1), embeddings(2, latent, 2));
+        let mut model = model(config, 0.5);
+        model.set_familiar_goals(&x_g[..1]);
+
+        for engine in engines() {
+            let mut planner = planner(&*engine, &model);
+            assert_eq!([&x_g[0], &x_g[1]].map(|x_g| planner.is_familiar(x_g)), [true, false], "{engine:?}");
+            let updated = queries(&x, &x_g, &[]);
+            let kept = [Query { keep_initial: true, ..updated[0] }, updated[1]];
+            let plans = planner.plan(&kept, &mut fixed(Solver::Gradient, 2));
+            for (query, plan) in kept.iter().zip(&plans) {
+                assert_eq!(&planner.plan(&[*query], &mut fixed(Solver::Gradient, 2))[0], plan, "{engine:?}");
+            }
+
+            let by_policy = planner.plan(&updated[..1], &mut fixed(Solver::Gradient, 0)).remove(0);
+            assert_eq!((&plans[0].actions, plans[0].iterations), (&by_policy.actions, 0), "{engine:?}");
+            assert_eq!(plans[0].inner_losses, [by_policy.inner_losses[0]; 3], "{engine:?}");
+            let by_updates = planner.plan(&updated, &mut fixed(Solver::Gradient, 2));
+            assert!(plans[1] == by_updates[1] && plans[0].actions != by_updates[0].actions, "{engine:?}");
+
+            let mut ongoing = Ongoing::new(Solver::Gradient, 2, false);
+            while !ongoing.is_over() {
+                planner.resume(&kept, &mut ongoing, &mut || false);
+            }
+            assert_eq!(ongoing.into_plans(), plans, "{engine:?}");
+        }
+    }
+}
+
 #[test]
 fn a_method_that_takes_the_steps_left_depends_on_them_and_no_other_does() {
     let ((x, _), (x_g, _)) = (embeddings(1, 6, 1), embeddings(1, 6, 2));
@@ -272,7 +308,7 @@ fn a_method_that_takes_the_steps_left_depends_on_them_and_no_other_does() {
         for method in MethodKind::ALL {
             let mut planner = planner(&*engine, &model(small_config(method), 0.1));
             let mut actions = |steps_left| {
-                let query = Query { x: &x[0], x_g: &x_g[0], steps_left, seed: 0, start: &[] };
+                let query = Query { x: &x[0], x_g: &x_g[0], steps_left, seed: 0, start: &[], keep_initial: false };
                 planner.plan(&[query], &mut fixed(Solver::Gradient, 1)).remove(0).actions
             };
             let changes = actions(3) != actions(4);
@@ -459,7 +495,7 @@ fn a_search_starts_from_the_actions_it_is_given() {
 fn random_actions_follow_the_seed() {
     let mut random = Random { actions: 4 };
     let mut plan = |seed| {
-        let query = Query { x: &[], x_g: &[], steps_left: 0, seed, start: &[] };
+        let query = Query { x: &[], x_g: &[], steps_left: 0, seed, start: &[], keep_initial: false };
         random.plan(&[query], &mut fixed(Solver::Gradient, 0)).remove(0).actions
     };
     assert_eq!(plan(1), plan(1));

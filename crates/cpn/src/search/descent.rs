@@ -36,7 +36,7 @@ impl Descent {
     }
 
     /// One update, for a searchable method. `last`: no update follows, so that no gradient is needed. `keep_best`: the result is
-    /// the best plan, else the last.
+    /// the best plan, else the last; in either case the initial one of a query that keeps it.
     pub fn update(&mut self, block: &mut impl PlanBlock, queries: &[Query<'_>], last: bool, keep_best: bool) {
         let rows = queries.len();
         if rows == 0 {
@@ -58,9 +58,9 @@ impl Descent {
         let purpose = if last { Purpose::Loss } else { Purpose::Gradient };
         let losses = block.roll_out(queries, Actions::Moved, purpose);
 
-        for (r, (plan, loss)) in self.plans.iter_mut().zip(losses).enumerate() {
+        for (r, ((plan, query), loss)) in self.plans.iter_mut().zip(queries).zip(losses).enumerate() {
             let best = plan.inner_losses[plan.inner_losses.len() - 1];
-            let better = loss < best || !keep_best;
+            let better = !query.keep_initial && (loss < best || !keep_best);
             if better {
                 plan.actions = block.plan(rows, r);
                 plan.iterations = self.done;

@@ -1,6 +1,7 @@
 //! Queries for plans, settings of their search, and plans.
 
-/// Input of a search: embeddings of an observation and a goal, number of steps left, seed, and initial actions.
+/// Input of a search: embeddings of an observation and a goal, number of steps left, seed, initial actions, and whether they are
+/// kept.
 #[derive(Debug, Clone, Copy)]
 pub struct Query<'a> {
     /// x, the observation's embedding, `[Z]`.
@@ -13,6 +14,8 @@ pub struct Query<'a> {
     pub seed: u64,
     /// Initial actions, `[H][A]`; the policy's if empty.
     pub start: &'a [Vec<f32>],
+    /// True if the result of gradient updates is the initial plan, as if none were better; ignored by solvers that sample.
+    pub keep_initial: bool,
 }
 
 /// A search: its solver and its number of iterations.
@@ -59,8 +62,8 @@ pub enum Solver {
 pub struct Plan {
     /// â_{t:t+H}, `[H][A]`; not clipped.
     pub actions: Vec<Vec<f32>>,
-    /// Inner loss before each iteration and after the last; of the best plan so far where a search keeps it. Empty for methods
-    /// that do not plan.
+    /// Inner loss before each iteration and after the last; of the best plan so far where a search keeps it, and of the initial
+    /// plan where that is kept. Empty for methods that do not plan.
     pub inner_losses: Vec<f32>,
     /// Number of iterations before this plan was found.
     pub iterations: usize,

@@ -42,7 +42,7 @@ fn check_file(file: &[u8]) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-/// Small checkpoints with each kind of encoder, and one with position dynamics.
+/// Small checkpoints with each kind of encoder, and one with position dynamics and familiar goals.
 static EXAMPLES: LazyLock<[Vec<u8>; 3]> = LazyLock::new(|| {
     let image = |latent| {
         EncoderConfig::Image(ImageEncoderConfig {
@@ -67,7 +67,8 @@ static EXAMPLES: LazyLock<[Vec<u8>; 3]> = LazyLock::new(|| {
 
 fn example(method: MethodKind, encoder: EncoderConfig, position_dynamics: bool) -> Vec<u8> {
     let sizes = ModelConfig { hidden: 2, gate_hidden: 1, actions: 2, ..ModelConfig::paper(method) };
-    let config = ModelConfig { encoder, position_dynamics, ..sizes };
+    let familiar_goals = if position_dynamics { 2 } else { 0 };
+    let config = ModelConfig { encoder, position_dynamics, familiar_goals, ..sizes };
     let provenance = Provenance {
         training_tasks: vec!["reach".into()],
         data_digest: "0".repeat(64),
@@ -75,7 +76,11 @@ fn example(method: MethodKind, encoder: EncoderConfig, position_dynamics: bool) 
         seed: 5,
         training: Training::paper(),
     };
-    checkpoint::to_bytes(&Model::new(config, 5), &provenance).expect("a checkpoint")
+    let mut model = Model::new(config, 5);
+    if position_dynamics {
+        model.set_familiar_goals(&[vec![0.0; 3], vec![1.0; 3]]);
+    }
+    checkpoint::to_bytes(&model, &provenance).expect("a checkpoint")
 }
 
 fn inputs() -> Vec<Vec<u8>> {

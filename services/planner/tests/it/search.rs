@@ -1,12 +1,15 @@
 //! Searches chosen by requests, over every transport.
 
-use crate::common::{self, Client, Fixture, PATIENCE, checkpoint, from_bytes, is, plan_request, serve, soon, timeless};
+use crate::common::{
+    self, Client, Fixture, PATIENCE, checkpoint, from_bytes, image, is, plan_request, serve, soon, timeless,
+};
 use cpn::method::{Observed, Ongoing, Query};
-use cpn::{Input, Method, MethodKind, Plan};
+use cpn::{Input, Method, MethodKind, Model, ModelConfig, Plan, Planner, Precision};
 use planner::model::RANDOM;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
+use testing::{provenance, small_config};
 use wire::Code;
 use wire::planner::PlanResponse;
 use wire::proto::{self, Solver};
@@ -48,6 +51,41 @@ async fn every_solver_is_deterministic_and_uses_the_warm_start() {
     let plain = timeless(client.plan(plan_request("cpn", 3)).await.unwrap());
     let trained = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..plan_request("cpn", 3) };
     assert_eq!(timeless(client.plan(trained).await.unwrap()), plain, "the gradient is the model's own way");
+}
+
+/// Checkpoint whose one familiar goal is the image of seed 0.
+fn familiar_checkpoint() -> Vec<u8> {
+    let mut model = Model::new(ModelConfig { familiar_goals: 1, ..small_config(MethodKind::Cpn) }, 1);
+    let embeddings = Planner::new(&model, Precision::Float32, 1).encode(&[Observed::Image(&image(0).data)]);
+    model.set_familiar_goals(&embeddings);
+    cpn::checkpoint::to_bytes(&model, &provenance(&["reach"], 1)).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_familiar_goal_keeps_the_policys_plan_unless_the_request_says_otherwise() {
+    let fixture = Fixture::start(&[("cpn", familiar_checkpoint())], |_| ()).await;
+    for client in fixture.clients() {
+        let plan = async |request: proto::PlanRequest| timeless(client.plan(request).await.unwrap());
+        let request = plan_request("cpn", 3);
+        let policy = plan(proto::PlanRequest { search: search(Solver::Gradient, 0, false), ..request.clone() }).await;
+        let updated =
+            plan(proto::PlanRequest { search: search(Solver::Gradient, None, false), ..request.clone() }).await;
+        assert_ne!(policy.actions, updated.actions);
+        assert_eq!((updated.iterations, updated.iterations_run), (1, 1));
+
+        let kept = plan(request.clone()).await;
+        assert_eq!((&kept.actions, kept.iterations, kept.iterations_run), (&policy.actions, 0, 1));
+        let by_id = Some(proto::plan_request::Goal::GoalId(kept.goal_id.clone()));
+        assert_eq!(plan(proto::PlanRequest { goal: by_id, ..request.clone() }).await, kept, "of a known goal");
+        let started = plan(proto::PlanRequest { warm_start: actions(&kept.warm_start), ..request.clone() }).await;
+        assert_eq!(started.iterations, 1, "a search from an initial plan was asked for");
+
+        let new = Some(proto::plan_request::Goal::GoalImage(image(5)));
+        let new = proto::PlanRequest { goal: new, ..request };
+        let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..new.clone() };
+        let new = plan(new).await;
+        assert_eq!((new.iterations, &new), (1, &plan(named).await), "over {}", client.transport());
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

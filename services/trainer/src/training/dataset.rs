@@ -3,6 +3,7 @@
 use crate::record::folder::{self, dataset_digest};
 use crate::record::frame;
 use anyhow::{Context, bail, ensure};
+use cpn::method::Observed;
 use cpn::{Frames, Input, images};
 use rayon::prelude::*;
 use recording::Episode as Recording;
@@ -146,6 +147,12 @@ impl Dataset {
     /// Frames of all episodes.
     pub fn frames(&self) -> &Frames {
         &self.frames
+    }
+
+    /// Final goal of each episode.
+    pub fn goals(&self) -> Vec<Observed<'_>> {
+        let frames = self.frames.observed();
+        self.episodes.iter().map(|episode| frames[episode.first_frame + episode.action_count]).collect()
     }
 
     /// Position of the hand in each frame, with mean 0 on each axis and standard deviation 1 over all axes; empty if a recorded step

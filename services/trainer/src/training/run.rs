@@ -7,7 +7,7 @@ use crate::training::sampler::Sampler;
 use anyhow::{Context, ensure};
 use cpn::archive::{self, Tensors};
 use cpn::checkpoint::{self, Provenance};
-use cpn::{Learner, Model, Recipe};
+use cpn::{Learner, Model, Precision, Recipe};
 use serde::{Deserialize, Serialize};
 use service_kit::files;
 use std::f64::consts::PI;
@@ -125,6 +125,11 @@ pub fn run(config: &Config, observer: &mut dyn Observer) -> anyhow::Result<Outco
     };
     let mut model = learner.model();
     model.set_position_step_size();
+    if model.config.familiar_goals > 0 {
+        // In the precision that planners have by default.
+        let embeddings = engine.planner(&model, Precision::Float32)?.encode(&dataset.goals());
+        model.set_familiar_goals(&embeddings);
+    }
     let bytes = checkpoint::to_bytes(&model, &provenance)?;
     files::write_atomically(&config.out, &bytes)?;
     state.remove()?;

@@ -61,7 +61,7 @@ fn end(model: &Model, mut hand: [f32; 3], goal: [f32; 3], updates: usize) -> [f3
     let mut planner = Planner::new(model, Precision::Float32, 1);
     for _ in 0..ACTIONS {
         let ends = planner.encode(&[Observed::Position(hand), Observed::Position(goal)]);
-        let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[] };
+        let query = Query { x: &ends[0], x_g: &ends[1], steps_left: 1, seed: 0, start: &[], keep_initial: false };
         let iterations = Iterations::Fixed(updates);
         let plans = planner.plan(&[query], &mut Search { solver: Solver::Gradient, iterations });
         hand = [0, 1, 2].map(|axis| hand[axis] + plans[0].actions[0][axis].clamp(-1.0, 1.0) / 100.0);

@@ -2,8 +2,9 @@
 
 use crate::common::{SPEC, episode, info, keep, steps};
 use cpn::engine::OuterLoss;
+use cpn::method::Observed;
 use cpn::recipe::GoalSampling;
-use cpn::{Input, Losses, ModelConfig, Precision, Preset, Recipe, Training, checkpoint};
+use cpn::{Input, Losses, Method, ModelConfig, Planner, Precision, Preset, Recipe, Training, checkpoint};
 use recording::Episode;
 use std::path::Path;
 use trainer::training::config::Config;
@@ -11,6 +12,7 @@ use trainer::training::dataset::Dataset;
 use trainer::training::progress::{Observer, Progress, StopIf};
 use trainer::training::run::{self, Outcome};
 use trainer::training::sampler::Sampler;
+use wire::Image;
 
 fn config(folder: &Path, name: &str) -> Config {
     let dataset = folder.join("data");
@@ -128,11 +130,47 @@ fn a_checkpoint_has_its_provenance() {
         let digest = finished(&config);
         let loaded = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap();
         assert_eq!(loaded.digest, digest);
-        assert_eq!(loaded.model.config, config.model);
+        // At most one goal of each episode is stored.
+        let familiar_goals = config.model.familiar_goals.min(2);
+        assert_eq!(loaded.model.config, ModelConfig { familiar_goals, ..config.model });
         assert_eq!(loaded.provenance.training_tasks, ["reach"]);
         assert_eq!((loaded.provenance.seed, &loaded.provenance.training), (4, &config.training));
         assert_eq!(loaded.provenance.data_digest.len(), 64);
         assert_eq!(loaded.provenance.render_spec, SPEC);
+    }
+}
+
+/// Demonstration whose last frame is one of similar goals: an image with a few rows of its own.
+fn with_similar_goal(seed: u64) -> Episode {
+    let mut steps = steps("reach", seed, 5);
+    let shared = episode("goal", 1, 2).steps()[1].frame.clone();
+    let own = steps[4].frame.data()[..2 * 3 * shared.width() as usize].to_vec();
+    let data = [&own, &shared.data()[own.len()..]].concat();
+    steps[4].frame = Image::new(shared.height(), shared.width(), data).unwrap().rendered_as(SPEC).unwrap();
+    Episode::new(info("reach", seed, &steps), steps).unwrap()
+}
+
+#[test]
+fn a_trained_model_recognises_the_goals_of_its_episodes() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = folder.path().join("data");
+    (0..6).for_each(|seed| keep(&dataset, &with_similar_goal(seed)));
+    let config = quick(Config { dataset, ..Preset::CpnPosition.into() }, 1, 6);
+    let model = ModelConfig { familiar_goals: 4, ..config.model };
+    let config = Config { out: folder.path().join("x.safetensors"), model, ..config };
+    finished(&config);
+
+    let model = checkpoint::from_bytes(&std::fs::read(&config.out).unwrap()).unwrap().model;
+    assert_eq!(model.config.familiar_goals, 4);
+    let mut planner = Planner::new(&model, Precision::Float32, 1);
+    let mut is_familiar = |frame: &Image| {
+        let x_g = planner.encode(&[Observed::Image(frame.data())]).remove(0);
+        planner.is_familiar(&x_g)
+    };
+    for seed in 0..6 {
+        let episode = with_similar_goal(seed);
+        assert!(is_familiar(&episode.steps()[4].frame), "the goal of episode {seed}");
+        assert!(!is_familiar(&episode.steps()[3].frame), "a random image");
     }
 }
 

@@ -3,6 +3,7 @@
 use super::worker::{BLOCK, Dynamics, Worker};
 use crate::config::{Input, ModelConfig};
 use crate::engine::networks::encoder::Encoder;
+use crate::familiar::FamiliarGoals;
 use crate::method::Method;
 use crate::model::Model;
 use crate::observation::Observed;
@@ -17,6 +18,7 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub struct Planner {
     config: ModelConfig,
+    familiar: Option<FamiliarGoals>,
     encoder: Encoder<f32>,
     searcher: Searcher<Worker<f32>>,
 }
@@ -24,11 +26,11 @@ pub struct Planner {
 impl Planner {
     /// A planner of a valid model on `threads` threads, at least one, with images embedded in `precision`.
     pub fn new(model: &Model, precision: Precision, threads: usize) -> Self {
-        let Model { config, weights } = model;
+        let Model { config, weights, familiar } = model;
         let dynamics = Arc::new(Dynamics::new(config, weights));
         let workers = (0..threads.max(1)).map(|_| Worker::new(Arc::clone(&dynamics))).collect();
         let encoder = Encoder::new(&config.encoder, precision, weights);
-        Self { config: config.clone(), encoder, searcher: Searcher::new(workers) }
+        Self { config: config.clone(), familiar: familiar.clone(), encoder, searcher: Searcher::new(workers) }
     }
 }
 
@@ -63,6 +65,10 @@ impl Method for Planner {
             let embeddings = encoder.forward(inputs, false, &mut worker.tape);
             embeddings.chunks_exact(encoder.latent()).map(<[f32]>::to_vec).collect()
         })
+    }
+
+    fn is_familiar(&self, x_g: &[f32]) -> bool {
+        self.familiar.as_ref().is_some_and(|familiar| familiar.contains(x_g))
     }
 
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {

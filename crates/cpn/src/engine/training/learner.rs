@@ -51,7 +51,7 @@ impl Learner for NativeLearner {
     }
 
     fn model(&self) -> Model {
-        Model { config: self.config.clone(), weights: self.adam.weights() }
+        Model { config: self.config.clone(), weights: self.adam.weights(), familiar: None }
     }
 
     fn state(&self) -> Tensors {
