@@ -46,6 +46,7 @@ ACCURATE = {"training.losses.position": 30}
 """Weight of the position loss by which positions in images of the development tasks are most accurate."""
 
 DEFAULT = "default"
+"""Number of updates that the planner chooses: no option."""
 CONTROLS = ("no-op", "oracle")
 """Controls of the evaluator."""
 
@@ -108,6 +109,7 @@ BEST = ("accurate-position-dynamics", "5")
 """Arm and number of updates that the others are compared with."""
 SEEDS = (0, 1)
 TRIALS = 20
+BOOTSTRAP: dict[str, Any] = {"method": "percentile", "n_resamples": 10_000, "rng": 0}
 
 Outcomes = dict[str, dict[str, list[int]]]
 """1 for a success, 0 for a failure, of each variation in the order of seeds, by number of updates and task."""
@@ -217,6 +219,7 @@ def differences() -> str:
     """Paired differences of the success rate on the reported tasks between `BEST` and the other columns, in Markdown.
 
     They are of the first training seed. Pairs are of the same variation; the intervals are bootstrapped over tasks.
+    Columns of other tasks, as long as not all groups were run, are left out.
     """
     columns = _reported(SEEDS[:1])
     best = columns.pop(BEST, None)
@@ -229,7 +232,7 @@ def differences() -> str:
             continue
         pairs = [np.array([best[task], other[task]]) for task in best]
         by_task = np.array([np.mean(mine - others) for mine, others in pairs])
-        interval = bootstrap((by_task,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+        interval = bootstrap((by_task,), np.mean, **BOOTSTRAP).confidence_interval
         alone = [sum(int(np.sum(pair[i] > pair[1 - i])) for pair in pairs) for i in (0, 1)]
         percent = [f"{100 * value:+.0f} %" for value in (by_task.mean(), interval.low, interval.high)]
         lines.append(f"| {_name(*column)} | {percent[0]} | {percent[1]} to {percent[2]} | {alone[0]} | {alone[1]} |")

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Fuzzes each decoder for FUZZ_SECONDS, 600 by default. An input that breaks one is kept in crates/fuzz/artifacts.
 #
-# Instrumented for coverage is the code of this repository, by a compiler wrapper that cargo applies to no other: dependencies
-# are those of `make test`.
+# Coverage instrumentation of this repository's code alone, by cargo's compiler wrapper for members of the workspace:
+# dependencies are those of `make test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

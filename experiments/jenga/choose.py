@@ -12,8 +12,13 @@ from planning import Planner, along, demonstrations, network
 from cpn_sim_worker import keys
 
 
-def choose(endpoint: str, planner_name: str, out: Path, episodes: list[str], models: list[str]) -> tuple[int, int]:
-    """Writes the table, and answers horizon and updates; each model is named `h<H>-u<U>`."""
+def choose(
+    endpoint: str, planner_name: str, out: Path, episodes: list[str], models: list[str], diverged: list[str]
+) -> tuple[int, int]:
+    """Writes the table, with the models whose training diverged, and answers horizon and updates.
+
+    Each model is named `h<H>-u<U>`.
+    """
     rows: list[dict[str, float]] = []
     with network(endpoint, keys.planner_alive(planner_name)) as session:
         recorded = demonstrations(session, episodes)
@@ -28,5 +33,5 @@ def choose(endpoint: str, planner_name: str, out: Path, episodes: list[str], mod
             rows.append({"horizon": horizon, "updates": updates, "deviation_cm": deviation_cm, "n": len(ends)})
             print(f"H = {horizon:2}, U = {updates}: {deviation_cm:.2f} cm from the target")
     best = min(rows, key=lambda row: row["deviation_cm"])
-    out.write_text(json.dumps({"length": length, "grid": rows, "chosen": best}, indent=2) + "\n")
+    out.write_text(json.dumps({"length": length, "grid": rows, "diverged": diverged, "chosen": best}, indent=2) + "\n")
     return int(best["horizon"]), int(best["updates"])

@@ -51,17 +51,19 @@ def choose_pair(lab: Lab, preset: str, episodes: list[str]) -> tuple[int, int]:
     grid = OUT / f"grid-{preset}"
     grid.mkdir(exist_ok=True)
 
+    diverged: list[str] = []
+
     def train_pair(pair: tuple[int, int]) -> None:
         try:
             train_missing(lab, grid / f"h{pair[0]}-u{pair[1]}.safetensors", preset, pair, 0, "final")
         except LabError as error:
             if "loss: expected a finite number" not in str(error):
                 raise
-            print(f"{preset}: the training with H = {pair[0]}, U = {pair[1]} diverged")
+            diverged.append(f"h{pair[0]}-u{pair[1]}")
 
     on_every_core(train_pair, GRIDS[preset])
     lab.planner(grid, name=grid.name)
-    pair = choose(lab.endpoint, grid.name, grid.with_suffix(".json"), episodes, names(grid))
+    pair = choose(lab.endpoint, grid.name, grid.with_suffix(".json"), episodes, names(grid), diverged)
     print(f"{preset}: chosen H = {pair[0]}, U = {pair[1]}")
     return pair
 

@@ -19,6 +19,9 @@ except ModuleNotFoundError as error:
 Frame = NDArray[np.uint8]
 Observation = dict[str, Any]
 
+VARIATIONS = 20
+"""Most variations that a reset tries."""
+
 
 class GoalImageEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """Environment of a Meta-World task, over the evaluation variations.
@@ -64,6 +67,7 @@ class GoalImageEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             ValueError: If the seed is one of demonstrations.
+            ExpertFailedError: If the expert solves none of 20 variations.
             OpenGLError: If OpenGL is missing or does not draw.
         """
         super().reset(seed=seed)
@@ -87,11 +91,12 @@ class GoalImageEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._scene.render()
 
     def _start(self, seed: int) -> tuple[Frame, dict[str, Any]]:
-        while True:
+        for _ in range(VARIATIONS - 1):
             try:
                 return self._scene.reset(seed=seed)
             except ExpertFailedError:
                 seed += FIRST_EVALUATION_SEED
+        return self._scene.reset(seed=seed)
 
     def _observation(self, frame: Frame) -> Observation:
         return {"pixels": {CAMERA: frame, GOAL: self._goal.copy()}}
