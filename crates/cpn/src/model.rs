@@ -78,11 +78,11 @@ impl Model {
     }
 
     /// Stores the configured number of the training episodes' goals, given as embeddings by the trained encoder, `[Z]` each. With fewer
-    /// episodes the configuration has their number from then on.
+    /// episodes the configuration has their number from then on; without any there are no familiar goals.
     pub fn set_familiar_goals(&mut self, embeddings: &[Vec<f32>]) {
         let familiar = FamiliarGoals::new(embeddings, self.config.familiar_goals as usize);
         self.config.familiar_goals = familiar.count() as i64;
-        self.familiar = Some(familiar);
+        self.familiar = (familiar.count() > 0).then_some(familiar);
     }
 }
 

@@ -65,6 +65,10 @@ fn familiar_goals_round_trip_and_others_leave_no_trace() {
     assert_eq!(loaded, model);
     assert_eq!(checkpoint::to_bytes(&loaded, &provenance()).unwrap(), bytes);
 
+    let mut of_no_episodes = loaded;
+    of_no_episodes.set_familiar_goals(&[]);
+    assert_eq!((of_no_episodes.config.familiar_goals, of_no_episodes.familiar), (0, None));
+
     let (tensors, metadata): (Tensors, Value) = archive::from_bytes(&saved()).unwrap();
     assert!(!tensors.keys().any(|name| name.contains("familiar")) && !metadata.to_string().contains("familiar"));
 }

@@ -155,8 +155,8 @@ impl Dataset {
         self.episodes.iter().map(|episode| frames[episode.first_frame + episode.action_count]).collect()
     }
 
-    /// Position of the hand in each frame, with mean 0 on each axis and standard deviation 1 over all axes; empty if a recorded step
-    /// has no state of at least three values.
+    /// Position of the hand in each frame, in the last of an episode of positions its goal, with mean 0 on each axis and standard
+    /// deviation 1 over all axes; empty if a recorded step has no state of at least three values.
     pub fn hand_positions(&self) -> &[[f32; 3]] {
         &self.hand_positions
     }

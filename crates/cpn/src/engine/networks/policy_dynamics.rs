@@ -204,8 +204,8 @@ impl<T: Element> PolicyDynamics<T> {
         }
     }
 
-    /// The gradient in state and action, without position dynamics: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless `is_first`, and writes ā,
-    /// `[R, A]`.
+    /// The gradient in state and action, without position dynamics: replaces x̄ after the step, `[R, Z]`, by x̄ before it, unless
+    /// `is_first`, and writes ā, `[R, A]`.
     pub fn vjp(
         &self,
         rows: usize,
