@@ -21,6 +21,7 @@
 //!
 //! Files are validated once, in [`checkpoint::from_bytes`]; a wrong shape after that is a bug and panics.
 
+mod approach;
 pub mod archive;
 mod batch;
 pub mod checkpoint;
@@ -39,6 +40,7 @@ pub mod search;
 pub mod steps_left;
 mod unique;
 
+pub use approach::Approach;
 pub use batch::Batch;
 pub use config::{EncoderConfig, Input, MethodKind, ModelConfig};
 pub use engine::{Engine, Planner};

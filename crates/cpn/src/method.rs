@@ -43,6 +43,11 @@ pub trait Method: Send {
         false
     }
 
+    /// True if the first three elements of embeddings are the hand's position, which updates move (position dynamics).
+    fn moves_positions(&self) -> bool {
+        false
+    }
+
     /// A plan for each query, all by the same search. A plan does not depend on the rest of the batch: in
     /// any bit natively, within rounding by libtorch.
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan>;

@@ -9,6 +9,8 @@ use std::time::Duration;
 const MAX_HORIZON: usize = 64;
 /// Largest absolute value in a warm start; executed actions are clipped to [-1, 1].
 const MAX_WARM_START: f32 = 1000.0;
+/// Largest absolute value in an approach's position, in standard deviations.
+const MAX_POSITION: f32 = 1000.0;
 /// Largest number of steps left.
 pub const MAX_STEPS_LEFT: u32 = 10_000;
 
@@ -44,6 +46,19 @@ pub struct PlanRequest {
     pub warm_start: Vec<Vec<f32>>,
     /// Number of steps that remain for the task, 1 to [`MAX_STEPS_LEFT`]; required by models that take it, ignored by others.
     pub steps_left: Option<u32>,
+    /// Approach of the episode, from the response before; not together with a search or a warm start.
+    pub approach: Option<Approach>,
+}
+
+/// Progress of an episode's hand towards its targets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Approach {
+    /// Number of targets that were reached or given up.
+    pub tried: u32,
+    /// Position of the hand when it last moved, standardised.
+    pub position: [f32; 3],
+    /// Number of plans since then.
+    pub plans: u32,
 }
 
 /// Plan.
@@ -69,6 +84,8 @@ pub struct PlanResponse {
     pub iterations_run: u32,
     /// Warm start of the next request: the plan shifted by one step; empty for methods that do not plan.
     pub warm_start: Vec<Vec<f32>>,
+    /// Approach for the next request; none for a model without position dynamics, or a request with a search or a warm start.
+    pub approach: Option<Approach>,
 }
 
 /// Time spent in each stage of a request, in seconds.
@@ -198,6 +215,7 @@ impl PlanRequest {
             search: None,
             warm_start: Vec::new(),
             steps_left: None,
+            approach: None,
         }
     }
 }
@@ -234,6 +252,12 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
             return Err(Error::invalid("deadline_ms", "a limit, for a search that goes on until then", 0));
         }
 
+        let approach = request.approach.map(Approach::try_from).transpose().map_err(|e| e.within("approach"))?;
+        let other = [("a search", search.is_some()), ("a warm start", !request.warm_start.is_empty())];
+        if let Some((other, _)) = other.into_iter().find(|(_, asked)| *asked && approach.is_some()) {
+            return Err(Error::invalid("approach", format!("none together with {other}"), "one"));
+        }
+
         Ok(Self {
             model: name("model", request.model)?,
             goal,
@@ -246,6 +270,7 @@ impl TryFrom<proto::PlanRequest> for PlanRequest {
             search,
             warm_start: warm_start("warm_start", request.warm_start)?,
             steps_left: request.steps_left.map(|steps| steps_left("steps_left", steps)).transpose()?,
+            approach,
         })
     }
 }
@@ -269,7 +294,31 @@ impl From<PlanRequest> for proto::PlanRequest {
             search: request.search.map(Into::into),
             warm_start: request.warm_start.into_iter().map(|values| proto::Action { values }).collect(),
             steps_left: request.steps_left,
+            approach: request.approach.map(Into::into),
         }
+    }
+}
+
+impl TryFrom<proto::Approach> for Approach {
+    type Error = Error;
+
+    fn try_from(approach: proto::Approach) -> Result<Self, Error> {
+        let proto::Approach { tried, position, plans } = approach;
+        let Ok(position) = <[f32; 3]>::try_from(position.as_slice()) else {
+            return Err(Error::invalid("position", "3 numbers", position.len()));
+        };
+        match position.iter().find(|value| value.is_nan() || value.abs() > MAX_POSITION) {
+            Some(value) => {
+                Err(Error::invalid("position", format!("numbers from -{MAX_POSITION} to {MAX_POSITION}"), value))
+            }
+            None => Ok(Self { tried, position, plans }),
+        }
+    }
+}
+
+impl From<Approach> for proto::Approach {
+    fn from(Approach { tried, position, plans }: Approach) -> Self {
+        Self { tried, position: position.to_vec(), plans }
     }
 }
 
@@ -298,6 +347,7 @@ impl TryFrom<proto::PlanResponse> for PlanResponse {
             iterations: response.iterations,
             iterations_run: response.iterations_run,
             warm_start: actions("warm_start", response.warm_start)?,
+            approach: response.approach.map(Approach::try_from).transpose().map_err(|e| e.within("approach"))?,
         })
     }
 }
@@ -316,6 +366,7 @@ impl From<PlanResponse> for proto::PlanResponse {
             iterations: response.iterations,
             iterations_run: response.iterations_run,
             warm_start: response.warm_start.into_iter().map(|values| proto::Action { values }).collect(),
+            approach: response.approach.map(Into::into),
         }
     }
 }

@@ -237,13 +237,14 @@ def test_refusal_is_no_outage(planner: Planner) -> None:
     assert episode.late == 0
 
 
-def test_episode_keeps_seed_warm_start_and_checkpoint(connect: Connect, variant: Variant) -> None:
+def test_episode_keeps_seed_warm_start_approach_and_checkpoint(connect: Connect, variant: Variant) -> None:
     requests = []
 
     def answer(request: planner_pb2.PlanRequest) -> planner_pb2.PlanResponse:
         requests.append(request)
         response = planner_pb2.PlanResponse(model_digest="d" * 64, goal_id="g" * 64)
         response.warm_start.add(values=[request.seed, 0.5])
+        response.approach.MergeFrom(planner_pb2.Approach(tried=request.approach.tried + 1, position=[0, 0.5, 1]))
         response.first_action.values.extend([0.25, request.seed])
         return response
 
@@ -265,3 +266,5 @@ def test_episode_keeps_seed_warm_start_and_checkpoint(connect: Connect, variant:
     assert (later.position.x, later.position.y, later.position.z) == (0, 0.5, 1)
     assert not cold.warm_start
     assert not later.warm_start
+    assert [request.HasField("approach") for request in requests] == [False, False, False, True]
+    assert (later.approach.tried, list(later.approach.position), later.approach.plans) == (1, [0, 0.5, 1], 0)

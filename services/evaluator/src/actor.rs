@@ -8,7 +8,7 @@ use crate::record::Model;
 use crate::trial::Fault;
 use recording::trial::Exchange;
 use std::time::Instant;
-use wire::planner::{Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
+use wire::planner::{Approach, Goal, PlanRequest, PlanResponse, RegisterGoalRequest, RegisterGoalResponse};
 use wire::sim::ResetResponse;
 use wire::{Code, Error, Image, Observation, Position, key};
 
@@ -40,8 +40,8 @@ impl<'a> Actor<'a> {
             return Ok(Self::Control(control));
         }
         let goal = link.goal(&planner, reset).await.map_err(|error| Fault::new(planner.clone(), error))?;
-        let (warm_start, exchanges) = (Vec::new(), Vec::new());
-        let planned = Planned { link, planner, model, planning, seed, start, goal, warm_start, exchanges };
+        let (warm_start, approach, exchanges) = (Vec::new(), None, Vec::new());
+        let planned = Planned { link, planner, model, planning, seed, start, goal, warm_start, approach, exchanges };
         Ok(Self::Planned(Box::new(planned)))
     }
 
@@ -89,6 +89,8 @@ pub(crate) struct Planned<'a> {
     goal: Goal,
     /// Initial actions of the next search; the policy's if empty.
     warm_start: Vec<Vec<f32>>,
+    /// Approach of the next plan.
+    approach: Option<Approach>,
     exchanges: Vec<Exchange>,
 }
 
@@ -98,7 +100,8 @@ impl Planned<'_> {
         let (goal, seed) = (self.goal.clone(), plan_seed(self.seed, step));
         let steps_left = self.planning.steps_left(reset.max_steps, step);
         let request = self.link.plan_request(self.model, self.planning, goal, observation, seed, steps_left);
-        let request = PlanRequest { warm_start: std::mem::take(&mut self.warm_start), ..request };
+        let warm_start = std::mem::take(&mut self.warm_start);
+        let request = PlanRequest { warm_start, approach: self.approach, ..request };
 
         let asked = self.start.elapsed();
         let mut plan = self.link.plan(&self.planner, request.clone()).await;
@@ -115,6 +118,8 @@ impl Planned<'_> {
         let actions = std::iter::once(response.first_action.clone()).chain(later).collect();
         if self.planning.warm_start {
             self.warm_start = moved_on(response.warm_start.clone(), applied - 1);
+        } else {
+            self.approach = response.approach;
         }
         let times = response.times;
         self.exchanges.push(Exchange { step, request, asked, response, answered: self.start.elapsed() });

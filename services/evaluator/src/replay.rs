@@ -160,6 +160,7 @@ mod tests {
             search,
             warm_start: vec![vec![0.5; 3]; 2],
             steps_left: Some(9),
+            approach: None,
         };
         let response = PlanResponse {
             actions: vec![vec![0.5, -2.0, 0.0]; 2],
@@ -172,6 +173,7 @@ mod tests {
             iterations: 2,
             iterations_run: 4,
             warm_start: vec![vec![0.5; 3]; 2],
+            approach: None,
         };
         Exchange { step: 0, request, asked: Duration::ZERO, response, answered: Duration::ZERO }
     }

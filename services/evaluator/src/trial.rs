@@ -246,7 +246,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use tokio::sync::watch;
-    use wire::planner::{PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
+    use wire::planner::{Approach, PlanRequest, RegisterGoalRequest, RegisterGoalResponse};
     use wire::sim::TrialPlan;
     use wire::{Image, Position, query, sim};
     use zenoh::Session;
@@ -337,6 +337,11 @@ mod tests {
                     goal_id: image(255).digest(),
                     iterations: 0,
                     iterations_run: request.search.map_or(0, |search| search.iterations.unwrap_or_default()),
+                    approach: Some(Approach {
+                        tried: 0,
+                        position: [0.0; 3],
+                        plans: request.approach.map_or(1, |approach| approach.plans + 1),
+                    }),
                 })
             };
             query::reply(query, result).unwrap();
@@ -462,6 +467,12 @@ mod tests {
         let (applied, steps, recording) = planned(Planning { warm_start: true, ..default }).await;
         assert_eq!((applied, steps), (vec![0, 1, 2], vec![]));
         assert!(recording.exchanges().iter().all(|exchange| exchange.request.search.is_none()));
+        // An approach goes on with each plan, but not beside a warm start.
+        let approaches = |recording: Recording| -> Vec<_> {
+            recording.exchanges().iter().map(|exchange| exchange.request.approach.map(|approach| approach.plans)).collect()
+        };
+        assert_eq!(approaches(recording), [None; 3]);
+        assert_eq!(approaches(planned(default).await.2), [None, Some(1), Some(2)]);
         // Two actions of the first plan, then the second plan, from the third action on.
         let (applied, steps, recording) = planned(Planning { apply_actions: 2, warm_start: true, ..default }).await;
         assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));

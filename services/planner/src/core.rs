@@ -6,7 +6,7 @@ use crate::model::{Computing, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
-use crate::task::{Answer, PlanTask};
+use crate::task::{Answer, PlanTask, approach_from_wire};
 use anyhow::{Context, ensure};
 use service_kit::files;
 use std::path::{Path, PathBuf};
@@ -95,7 +95,7 @@ impl PlannerCore {
 
     /// Resolves the names in a request and checks its images.
     fn task(&self, request: PlanRequest) -> Result<PlanTask, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left } =
+        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left, approach } =
             request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
@@ -128,6 +128,7 @@ impl PlannerCore {
             search,
             warm_start,
             steps_left,
+            approach: approach.map(approach_from_wire),
             span: Span::current(),
         })
     }

@@ -282,6 +282,7 @@ mod tests {
             search,
             warm_start: Vec::new(),
             steps_left: None,
+            approach: None,
             span: Span::none(),
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::load::{Costs, resolve};
 use crate::signatures::Signatures;
-use crate::task::{Answer, PlanTask};
+use crate::task::{Answer, Latents, PlanTask, approach_to_wire};
 use cpn::checkpoint::{self, Checkpoint, Provenance};
 use cpn::method::{self, Iterations, Observed, Ongoing, Query, Solver};
 use cpn::{Engine, Input, Method, Plan, Precision, Random, images};
@@ -138,7 +138,7 @@ impl Model {
             let plan =
                 self.method.plan(&[query], &mut method::Search { solver, iterations: iterations_left }).remove(0);
             self.costs.record_rollouts(solver, method::rollouts(solver, iterations), started.elapsed());
-            check_plan(&plan, &query).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
+            check_plan(&plan, query.x, query.x_g).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
         }
         Ok(())
     }
@@ -147,7 +147,8 @@ impl Model {
     ///
     /// # Errors
     /// If the goal or observation is of the wrong kind or has another render spec, the task has no number of steps left but the
-    /// method takes it, or a search or warm start but the method does not plan, or the warm start is not `[horizon, actions]`.
+    /// method takes it, or a search or warm start but the method does not plan, or an approach but
+    /// the model has no position dynamics, or the warm start is not `[horizon, actions]`.
     pub(crate) fn check(&self, task: &PlanTask) -> Result<(), Error> {
         self.check_takes(task.goal_field, &task.goal)?;
         self.check_takes(task.observation_field(), &task.observation)?;
@@ -160,6 +161,10 @@ impl Model {
             if let Some((field, _)) = asked.into_iter().find(|(_, asked)| *asked) {
                 return Err(Error::invalid(field, "none for a method that does not plan", self.method.name()));
             }
+        }
+
+        if task.approach.is_some() && !self.method.moves_positions() {
+            return Err(Error::invalid("approach", "none for a model without position dynamics", &self.info.name));
         }
 
         let (horizon, size) = (self.method.horizon(), self.method.actions());
@@ -208,8 +213,8 @@ impl Model {
     ///
     /// # Errors
     /// If a number of the plan is not finite.
-    pub(crate) fn response(&self, task: &PlanTask, plan: Plan, query: &Query<'_>, times: StageTimes) -> Answer {
-        let latent_distance = check_plan(&plan, query)?;
+    pub(crate) fn response(&self, task: &PlanTask, plan: Plan, latents: &Latents, times: StageTimes) -> Answer {
+        let latent_distance = check_plan(&plan, &latents.x, &latents.goal.x_g)?;
         let first_action = plan.actions.first().into_iter().flatten().map(|v| v.clamp(-1.0, 1.0)).collect();
         let next = plan.actions.iter().skip(1).chain(plan.actions.last()).cloned();
         Ok(PlanResponse {
@@ -223,14 +228,15 @@ impl Model {
             times,
             model_digest: self.info.digest.clone(),
             goal_id: task.goal_id.clone(),
+            approach: latents.approach.map(approach_to_wire),
         })
     }
 }
 
-/// Checks that a plan is finite; returns the Euclidean distance between the query's latents, none if Z is 0.
-fn check_plan(plan: &Plan, query: &Query<'_>) -> Result<Option<f32>, Error> {
-    let squares = query.x.iter().zip(query.x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
-    let latent_distance = (!query.x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);
+/// Checks that a plan is finite; returns the Euclidean distance between the embeddings of observation and goal, none if Z is 0.
+fn check_plan(plan: &Plan, x: &[f32], x_g: &[f32]) -> Result<Option<f32>, Error> {
+    let squares = x.iter().zip(x_g).map(|(x, x_g)| f64::from(x - x_g).powi(2));
+    let latent_distance = (!x.is_empty()).then(|| squares.sum::<f64>().sqrt() as f32);
     check_finite("actions", plan.actions.iter().flatten())?;
     check_finite("inner_losses", plan.inner_losses.iter())?;
     check_finite("latent_distance", latent_distance.iter())?;

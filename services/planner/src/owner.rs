@@ -280,8 +280,8 @@ impl Owner {
             encode_seconds: encoded.as_secs_f64(),
             plan_seconds: planned.as_secs_f64(),
         };
-        let planned = tasks.iter().zip(plans).zip(&queries);
-        planned.map(|((task, plan), query)| model.response(task, plan, query, times)).collect()
+        let planned = tasks.iter().zip(plans).zip(&latents);
+        planned.map(|((task, plan), latents)| model.response(task, plan, latents, times)).collect()
     }
 
     /// Begins a sliced search for a batch of checked tasks.
@@ -322,7 +322,10 @@ fn encode(model: &mut Model, embeddings: &mut Embeddings, tasks: &[&PlanTask]) -
     let mut new = new.map(|x_g| GoalEmbedding { is_familiar: model.method.is_familiar(&x_g), x_g });
     let goals: Vec<_> = known.into_iter().map(|known| known.or_else(|| new.next()).unwrap_or_default()).collect();
     keys.into_iter().zip(&goals).for_each(|(key, goal)| drop(embeddings.put(key, goal.clone())));
-    xs.into_iter().zip(goals).collect()
+
+    let moves_positions = model.method.moves_positions();
+    let embedded = tasks.iter().zip(xs).zip(goals);
+    embedded.map(|((task, x), goal)| Latents::new(task, x, goal, moves_positions)).collect()
 }
 
 /// Records metrics of an answer: the count, and the time of each stage.

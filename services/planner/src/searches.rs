@@ -155,13 +155,13 @@ impl SlicedSearch {
     fn finish(self) -> Vec<(Accepted, Answer)> {
         let Self { tasks, latents, model, ongoing, encoded, searched, .. } = self;
         let plans = ongoing.into_plans();
-        let answers = plans.into_iter().zip(queries(&tasks, &latents)).zip(&tasks).map(|((plan, query), accepted)| {
+        let answers = plans.into_iter().zip(&latents).zip(&tasks).map(|((plan, latents), accepted)| {
             let times = StageTimes {
                 queue_seconds: accepted.enqueued.elapsed().saturating_sub(encoded + searched).as_secs_f64(),
                 encode_seconds: encoded.as_secs_f64(),
                 plan_seconds: searched.as_secs_f64(),
             };
-            model.model().response(&accepted.task, plan, &query, times)
+            model.model().response(&accepted.task, plan, latents, times)
         });
         let answers: Vec<_> = answers.collect();
         tasks.into_iter().zip(answers).collect()

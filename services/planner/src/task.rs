@@ -2,13 +2,14 @@
 
 use crate::load::Estimate;
 use crate::outbox::Outbox;
+use cpn::Approach;
 use cpn::method::Query;
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 use tracing::Span;
-use wire::planner::{PlanResponse, Search, Solver};
+use wire::planner::{self, PlanResponse, Search, Solver};
 use wire::{Code, Error, Observation};
 
 /// Plan request with resolved names and checked image sizes.
@@ -29,6 +30,8 @@ pub(crate) struct PlanTask {
     pub(crate) warm_start: Vec<Vec<f32>>,
     /// Number of steps that remain for the task.
     pub(crate) steps_left: Option<u32>,
+    /// Approach of the episode, from the response before.
+    pub(crate) approach: Option<Approach>,
     /// Tracing span of the request.
     pub(crate) span: Span,
 }
@@ -76,22 +79,64 @@ pub(crate) struct GoalEmbedding {
     pub(crate) is_familiar: bool,
 }
 
-/// Embeddings of a task's observation, `[Z]`, and goal.
-pub(crate) type Latents = (Vec<f32>, GoalEmbedding);
+/// Approach of a request.
+pub(crate) fn approach_from_wire(planner::Approach { tried, position, plans }: planner::Approach) -> Approach {
+    Approach { tried, position, plans }
+}
+
+/// Approach of a response.
+pub(crate) fn approach_to_wire(Approach { tried, position, plans }: Approach) -> planner::Approach {
+    planner::Approach { tried, position, plans }
+}
+
+/// Embeddings of a task's observation and goal, and the target of its plan.
+#[derive(Debug)]
+pub(crate) struct Latents {
+    /// x, `[Z]`.
+    pub(crate) x: Vec<f32>,
+    pub(crate) goal: GoalEmbedding,
+    /// Approach, of a model with position dynamics and a task without a search and a warm start.
+    pub(crate) approach: Option<Approach>,
+    /// Embedding to plan towards, `[Z]`: x_g, or that with the position of the approach's target.
+    towards: Vec<f32>,
+}
+
+impl Latents {
+    /// Embeddings of a task, with its approach if the model has position dynamics.
+    pub(crate) fn new(task: &PlanTask, x: Vec<f32>, goal: GoalEmbedding, moves_positions: bool) -> Self {
+        let approach = (moves_positions && task.has_default_search()).then(|| match task.approach {
+            Some(approach) => approach.next(&x, &goal.x_g, goal.is_familiar),
+            None => Approach::first(&x),
+        });
+        let towards = approach.map_or_else(|| goal.x_g.clone(), |approach| approach.towards(&goal.x_g, goal.is_familiar));
+        Self { x, goal, approach, towards }
+    }
+
+    /// Whether the policy's plan is kept: for a familiar goal, unless the approach has left it.
+    fn keeps_policy(&self) -> bool {
+        let GoalEmbedding { is_familiar, .. } = self.goal;
+        is_familiar && self.approach.is_none_or(|approach| approach.keeps_policy(is_familiar))
+    }
+}
 
 impl PlanTask {
     /// Query of the task, from its embeddings. For a familiar goal the policy's plan is kept, unless the request names a search or an
     /// initial plan.
-    pub(crate) fn query<'a>(&'a self, (x, goal): &'a Latents) -> Query<'a> {
+    pub(crate) fn query<'a>(&'a self, latents: &'a Latents) -> Query<'a> {
         Query {
-            x,
-            x_g: &goal.x_g,
+            x: &latents.x,
+            x_g: &latents.towards,
             // Checked for methods that take it.
             steps_left: self.steps_left.unwrap_or_default(),
             seed: self.seed,
             start: &self.warm_start,
-            keep_initial: goal.is_familiar && self.search.is_none() && self.warm_start.is_empty(),
+            keep_initial: self.has_default_search() && latents.keeps_policy(),
         }
+    }
+
+    /// Whether the request leaves the search to the model: it names none, and has no warm start.
+    fn has_default_search(&self) -> bool {
+        self.search.is_none() && self.warm_start.is_empty()
     }
 
     /// Whether both tasks fit in one batch: same model, checkpoint, search and kind of start.

@@ -10,7 +10,7 @@ use recording::{Episode, ReadError};
 use std::io::Cursor;
 use std::time::Duration;
 use wire::demonstration::{DemonstrationStep, RecordedEpisode, digest};
-use wire::planner::{Goal, PlanRequest, PlanResponse, StageTimes};
+use wire::planner::{Approach, Goal, PlanRequest, PlanResponse, StageTimes};
 use wire::sim::Variation;
 use wire::trial::RecordedTrial;
 use wire::{Image, Position};
@@ -124,6 +124,7 @@ fn trial(goal_position: Option<Position>) -> Recording {
         iterations: 1,
         iterations_run: 1,
         warm_start: Vec::new(),
+        approach: Some(Approach { tried: 1, position: [0.5; 3], plans: 2 }),
     };
     let goal = || goal_position.map_or_else(|| Goal::Id(image(9).digest()), Goal::Position);
     let exchange = |step: u32| Exchange {

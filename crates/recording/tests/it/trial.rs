@@ -3,7 +3,7 @@
 use mcap::MessageStream;
 use recording::trial::{Exchange, Frame, Recording, from_bytes, to_bytes};
 use std::time::Duration;
-use wire::planner::{Goal, PlanRequest, PlanResponse, StageTimes};
+use wire::planner::{Approach, Goal, PlanRequest, PlanResponse, StageTimes};
 use wire::sim::Variation;
 use wire::trial::RecordedTrial;
 use wire::{Image, Observation, Position};
@@ -36,6 +36,7 @@ fn exchange(plan: u8) -> Exchange {
         search: None,
         warm_start: vec![vec![0.5, -0.0]],
         steps_left: Some(70 - step),
+        approach: None,
     };
     let response = PlanResponse {
         actions: vec![vec![1.5, -0.0], vec![0.0, f32::MIN_POSITIVE]],
@@ -48,6 +49,7 @@ fn exchange(plan: u8) -> Exchange {
         iterations: 1,
         iterations_run: 1,
         warm_start: vec![vec![0.0, 1.0]],
+        approach: Some(Approach { tried: 1, position: [-0.0, 0.5, f32::MIN_POSITIVE], plans: step }),
     };
     let asked = time(step) + Duration::from_nanos(3);
     Exchange { step, request, asked, response, answered: asked + Duration::from_nanos(7) }

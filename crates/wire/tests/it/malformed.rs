@@ -48,7 +48,8 @@ fn each_wrong_field_is_named() {
         Some(proto::Search { solver: solver.into(), samples, anytime, ..Default::default() })
     };
     let action = |count| proto::Action { values: vec![0.0; count] };
-    let cases: [(Error, &str, &str, &str); 20] = [
+    let approach = |position| Some(proto::Approach { position, ..Default::default() });
+    let cases: [(Error, &str, &str, &str); 24] = [
         (refusal(|r| r.model = "../x".into()), "model", "1 to 64 of a-z", "\"../x\""),
         (refusal(|r| r.goal = None), "goal", "a value", "none"),
         (
@@ -96,6 +97,25 @@ fn each_wrong_field_is_named() {
             "warm_start",
             "numbers from -1000 to 1000",
             "-10000",
+        ),
+        (refusal(|r| r.approach = approach(vec![0.0; 2])), "approach.position", "3 numbers", "2"),
+        (
+            refusal(|r| r.approach = approach(vec![0.0, f32::NAN, 0.0])),
+            "approach.position",
+            "numbers from -1000 to 1000",
+            "NaN",
+        ),
+        (
+            refusal(|r| (r.approach, r.warm_start) = (approach(vec![0.0; 3]), vec![action(4)])),
+            "approach",
+            "none together with a warm start",
+            "one",
+        ),
+        (
+            refusal(|r| (r.approach, r.search) = (approach(vec![0.0; 3]), search(proto::Solver::Cem, 8, false))),
+            "approach",
+            "none together with a search",
+            "one",
         ),
         (refusal(|r| r.steps_left = Some(0)), "steps_left", "1 to 10000", "0"),
         (refusal(|r| r.steps_left = Some(10_001)), "steps_left", "1 to 10000", "10001"),

@@ -35,6 +35,11 @@ fn position() -> impl Strategy<Value = Vec<f32>> {
     prop_oneof![Just(Vec::new()), vec(-1.0f32..1.0, 3)]
 }
 
+fn approach() -> impl Strategy<Value = Approach> {
+    (any::<u32>(), proptest::array::uniform3(-1000.0f32..=1000.0), any::<u32>())
+        .prop_map(|(tried, position, plans)| Approach { tried, position, plans })
+}
+
 fn point() -> impl Strategy<Value = Position> {
     proptest::array::uniform3(-1000.0f32..=1000.0).prop_map(|metres| Position::new(metres).unwrap())
 }
@@ -143,10 +148,15 @@ proptest! {
         search in option::of(search()),
         warm_start in vec(action(), 0..6),
         steps_left in option::of(1..=MAX_STEPS_LEFT),
+        approach in option::of(approach()),
     ) {
         // An anytime search needs a deadline.
         let deadline = deadline.or_else(|| search?.anytime.then_some(Duration::from_millis(1)));
-        survives(PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left });
+        // An approach comes without a search and a warm start.
+        let approach = approach.filter(|_| search.is_none() && warm_start.is_empty());
+        let request =
+            PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left, approach };
+        survives(request);
     }
 
     #[test]
@@ -160,6 +170,7 @@ proptest! {
         goal_id in digest(),
         (iterations, iterations_run) in any::<(u32, u32)>(),
         warm_start in vec(action(), 0..6),
+        approach in option::of(approach()),
         (episode_id, model) in (".{0,20}", name()),
     ) {
         let times = StageTimes { queue_seconds, encode_seconds, plan_seconds };
@@ -174,6 +185,7 @@ proptest! {
             iterations,
             iterations_run,
             warm_start,
+            approach,
         };
         survives(plan.clone());
         survives(TrialPlan { episode_id, step: iterations, model, plan });

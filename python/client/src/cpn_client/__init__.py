@@ -12,12 +12,13 @@ from cpn_client.errors import (
     UnreachableError,
 )
 from cpn_client.image import Image
-from cpn_client.plan import Goal, Model, Plan, Search, StageTimes
+from cpn_client.plan import Approach, Goal, Model, Plan, Search, StageTimes
 from cpn_client.planner import AsyncPlanner, Planner
 from cpn_client.recording import recorded_goal, recorded_observation
 from cpn_client.transport import Tls
 
 __all__ = [
+    "Approach",
     "AsyncEpisode",
     "AsyncPlanner",
     "Episode",

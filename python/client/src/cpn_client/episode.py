@@ -54,6 +54,7 @@ class _Steps:
             "observation": frame,
             "seed": self._seed + self.steps,
             "warm_start": last.warm_start if last and self._warm_start else (),
+            "approach": last.approach if last and not self._warm_start else None,
             "model_digest": last.model_digest if last else "",
             "steps_left": steps_left,
         }

@@ -42,6 +42,22 @@ class Goal:
 
 
 @dataclass(frozen=True)
+class Approach:
+    """Progress of an episode's hand towards its targets, of a model with position dynamics."""
+
+    tried: int
+    """Number of targets that were reached or given up."""
+    position: tuple[float, ...]
+    """[3], position of the hand when it last moved, standardised."""
+    plans: int
+    """Number of plans since then."""
+
+    def to_proto(self) -> planner_pb2.Approach:
+        """Message of the approach."""
+        return planner_pb2.Approach(tried=self.tried, position=self.position, plans=self.plans)
+
+
+@dataclass(frozen=True)
 class StageTimes:
     """Time of each stage of a plan, in seconds."""
 
@@ -73,6 +89,9 @@ class Plan:
     iterations_run: int
     warm_start: tuple[Action, ...]
     """[horizon, A], plan to start the next step's search from; empty for methods that do not plan."""
+    approach: Approach | None
+    """Approach for the next step's request; None for models without position dynamics, and for a request with a search or
+    a warm start."""
     request_bytes: int
     """Size of the request, in bytes."""
 

@@ -13,7 +13,7 @@ from cpn_client.deadline import Deadline, retries
 from cpn_client.episode import AsyncEpisode, Episode
 from cpn_client.errors import PlannerError
 from cpn_client.image import Image, ImageLike, Position
-from cpn_client.plan import Action, Goal, Model, Plan, Search
+from cpn_client.plan import Action, Approach, Goal, Model, Plan, Search
 from cpn_client.requests import Exchange
 from cpn_client.transport import AsyncTransport, Transport
 
@@ -47,6 +47,7 @@ class Planner:
         deadline_ms: int | None = None,
         search: Search | None = None,
         warm_start: Sequence[Action] = (),
+        approach: Approach | None = None,
         steps_left: int | None = None,
         model_digest: str = "",
     ) -> Plan:
@@ -62,6 +63,8 @@ class Planner:
             deadline_ms: Longest wait for the plan, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             warm_start: [horizon, A], initial plan of the search: `Plan.warm_start` of the step before.
+            approach: `Plan.approach` of the step before, for a new target where the hand stalls; None at the first step, or
+                to plan straight towards the goal. Not together with `search` or `warm_start`.
             steps_left: Number of steps that remain for the task, for models of the method te-bc-horizon.
             model_digest: SHA-256, in hex, of the checkpoint that must answer; any if empty.
 
@@ -80,6 +83,7 @@ class Planner:
             deadline_ms=deadline_ms,
             search=search,
             warm_start=warm_start,
+            approach=approach,
             steps_left=steps_left,
             model_digest=model_digest,
         )
@@ -173,6 +177,7 @@ class AsyncPlanner:
         deadline_ms: int | None = None,
         search: Search | None = None,
         warm_start: Sequence[Action] = (),
+        approach: Approach | None = None,
         steps_left: int | None = None,
         model_digest: str = "",
     ) -> Plan:
@@ -185,6 +190,7 @@ class AsyncPlanner:
             deadline_ms=deadline_ms,
             search=search,
             warm_start=warm_start,
+            approach=approach,
             steps_left=steps_left,
             model_digest=model_digest,
         )

@@ -16,7 +16,7 @@ from cpn.v1 import planner_pb2, types_pb2
 from cpn_client.deadline import Deadline
 from cpn_client.errors import LateError, PlannerError, RefusedError
 from cpn_client.image import Image, ImageLike, Position, image_or_position
-from cpn_client.plan import Action, Goal, Model, Plan, Search, StageTimes
+from cpn_client.plan import Action, Approach, Goal, Model, Plan, Search, StageTimes
 
 T = TypeVar("T")
 M = TypeVar("M", bound=Message)
@@ -56,6 +56,7 @@ def plan_request(
     deadline_ms: int | None,
     search: Search | None,
     warm_start: Sequence[Action],
+    approach: Approach | None,
     steps_left: int | None,
     model_digest: str,
 ) -> planner_pb2.PlanRequest:
@@ -71,6 +72,7 @@ def plan_request(
         model_digest=model_digest,
         search=search.to_proto() if search else None,
         warm_start=[types_pb2.Action(values=action) for action in warm_start],
+        approach=approach.to_proto() if approach else None,
         steps_left=steps_left,
     )
     if isinstance(goal, Goal):
@@ -139,12 +141,20 @@ def _plan(response: planner_pb2.PlanResponse, request_bytes: int) -> Plan:
         iterations=response.iterations,
         iterations_run=response.iterations_run,
         warm_start=_actions(response.warm_start),
+        approach=_approach(response),
         request_bytes=request_bytes,
     )
 
 
 def _actions(actions: Sequence[types_pb2.Action]) -> tuple[Action, ...]:
     return tuple(tuple(action.values) for action in actions)
+
+
+def _approach(response: planner_pb2.PlanResponse) -> Approach | None:
+    if not response.HasField("approach"):
+        return None
+    approach = response.approach
+    return Approach(approach.tried, tuple(approach.position), approach.plans)
 
 
 def _decode(message_type: type[M], payload: bytes) -> M:

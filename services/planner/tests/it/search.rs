@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use testing::{provenance, small_config};
 use wire::Code;
-use wire::planner::PlanResponse;
+use wire::planner::{Approach, PlanResponse};
 use wire::proto::{self, Solver};
 
 const SOLVERS: [Solver; 4] = [Solver::Gradient, Solver::Cem, Solver::Mppi, Solver::Hybrid];
@@ -85,6 +85,33 @@ async fn a_familiar_goal_keeps_the_policys_plan_unless_the_request_says_otherwis
         let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..new.clone() };
         let new = plan(new).await;
         assert_eq!((new.iterations, &new), (1, &plan(named).await), "over {}", client.transport());
+    }
+}
+
+/// While the observation stays the same, the hand has stalled: after eight plans the target is another.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_approach_moves_the_target_when_the_hand_stalls() {
+    let config = ModelConfig { position_dynamics: true, updates: 2, ..small_config(MethodKind::Cpn) };
+    let moving = cpn::checkpoint::to_bytes(&Model::new(config, 1), &provenance(&["reach"], 1)).unwrap();
+    let fixture = Fixture::start(&[("moving", moving), ("cpn", checkpoint(MethodKind::Cpn, 1))], |_| ()).await;
+    for client in fixture.clients() {
+        let request = plan_request("moving", 3);
+        let first = timeless(client.plan(request.clone()).await.unwrap());
+        let mut last = first.clone();
+        for plans in 1..=8 {
+            let approach = last.approach.map(Into::into);
+            last = timeless(client.plan(proto::PlanRequest { approach, ..request.clone() }).await.unwrap());
+            let Approach { tried, plans: still, .. } = last.approach.unwrap();
+            assert_eq!((tried, still), if plans < 8 { (0, plans) } else { (1, 0) });
+            assert_eq!(last.latent_distance, first.latent_distance);
+            assert_eq!(last.actions == first.actions, tried == 0, "over {}", client.transport());
+        }
+
+        let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..request };
+        assert_eq!(timeless(client.plan(named).await.unwrap()), PlanResponse { approach: None, ..first });
+        let approach = last.approach.map(Into::into);
+        let other = client.plan(proto::PlanRequest { approach, ..plan_request("cpn", 3) }).await;
+        is(Code::InvalidArgument, "approach", other);
     }
 }
 

@@ -71,6 +71,10 @@ impl Method for Planner {
         self.familiar.as_ref().is_some_and(|familiar| familiar.contains(x_g))
     }
 
+    fn moves_positions(&self) -> bool {
+        self.config.position_dynamics
+    }
+
     fn plan(&mut self, queries: &[Query<'_>], search: &mut Search<'_>) -> Vec<Plan> {
         self.searcher.plan(queries, search)
     }

@@ -45,6 +45,7 @@ fn planner() -> Vec<Example> {
             steps_left: Some(70),
             ..plan(Goal::Id(digest()), image().into())
         }),
+        example(PlanRequest { approach: Some(approach()), ..plan(Goal::Image(image()), image().into()) }),
         example(plan_response()),
         example(RegisterGoalRequest { image: image() }),
         example(RegisterGoalResponse { goal_id: digest() }),
@@ -80,7 +81,12 @@ fn plan_response() -> PlanResponse {
         iterations: 1,
         iterations_run: 2,
         warm_start: vec![action(); 2],
+        approach: Some(approach()),
     }
+}
+
+fn approach() -> Approach {
+    Approach { tried: 1, position: [0.5; 3], plans: 2 }
 }
 
 fn simulator() -> Vec<Example> {
