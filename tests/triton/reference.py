@@ -1,4 +1,4 @@
-"""Plan by cpn-client, in JSON, for which the environment of the examples has another protobuf than Triton's client.
+"""Plan by cpn-client, in JSON. It runs in the environment of the examples: Triton's client needs an older protobuf.
 
 examples/.venv/bin/python tests/triton/reference.py ADDRESS MODEL SEED UPDATES, without updates for the model's own.
 """
