@@ -169,7 +169,7 @@ async fn the_server_describes_itself_and_its_models() {
         let request = ModelReadyRequest { name: name.into(), version: version.into() };
         client.clone().model_ready(request).await.unwrap().into_inner().ready
     };
-    assert_eq!(metadata(&client, "cpn", &before).await.unwrap().versions, [before.clone()]);
+    assert_eq!(metadata(&client, "cpn", &before).await.unwrap().versions, [before.as_str()]);
     assert!(ready("cpn", "").await && ready("cpn", &before).await && !ready("gpt", "").await);
     let unknown = metadata(&client, "gpt", "").await.unwrap_err();
     assert_eq!((unknown.code, unknown.field.as_str()), (Code::NotFound, "name"), "{unknown}");
@@ -178,7 +178,7 @@ async fn the_server_describes_itself_and_its_models() {
     core.load_model(from_bytes("cpn", checkpoint(MethodKind::Cpn, 2))).await.unwrap();
     let after = core.digest("cpn").await;
     assert!(ready("cpn", &after).await && !ready("cpn", &before).await);
-    assert_eq!(metadata(&client, "cpn", "").await.unwrap().versions, [after.clone()]);
+    assert_eq!(metadata(&client, "cpn", "").await.unwrap().versions, [after.as_str()]);
     let old = metadata(&client, "cpn", &before).await.unwrap_err();
     assert_eq!(old, Error::new(Code::NotFound, "version", &after, &before));
     for (version, digest) in [("", &after), (&after, &after), (&before, &before)] {
