@@ -10,6 +10,7 @@ EXPORT := python/export/.venv
 VIEW := python/view/.venv
 BENCH := python/bench-peers/.venv
 OPENPI := tests/openpi/.venv
+TRITON := tests/triton/.venv
 KUBERNETES := tests/kubernetes/.venv
 STACK := tests/stack/.venv
 ADAPTERS := $(addprefix python/,lerobot stable-worldmodel vla-eval)
@@ -24,7 +25,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-kubernetes test-stack test-bench test-experiment test-shipped fuzz test-fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-triton test-kubernetes test-stack test-bench test-experiment test-shipped fuzz test-fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -71,6 +72,10 @@ $(BENCH)/.ready: python/bench-peers/pyproject.toml python/bench-peers/uv.lock | 
 
 $(OPENPI)/.ready: tests/openpi/pyproject.toml tests/openpi/uv.lock $(MESSAGES) | $(UV)
 	cd tests/openpi && $(UV) sync --quiet --locked
+	touch $@
+
+$(TRITON)/.ready: tests/triton/pyproject.toml tests/triton/uv.lock | $(UV)
+	cd tests/triton && $(UV) sync --quiet --locked
 	touch $@
 
 $(KUBERNETES)/.ready: tests/kubernetes/pyproject.toml tests/kubernetes/uv.lock | $(UV)
@@ -165,6 +170,11 @@ test-openpi: setup $(OPENPI)/.ready ## Hold the planner to openpi's own client
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-certs
 	cd tests/openpi && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
 
+test-triton: setup $(TRITON)/.ready ## Hold the planner to Triton's own client
+	cargo test --workspace --locked --test it -- kserve::
+	cargo build --workspace --locked --bin cpn-planner
+	cd tests/triton && $(UV) run --quiet basedpyright && $(UV) run --quiet pytest
+
 test-client: setup $(CLIENT)/.ready ## Run the Python client against planners that answer, come late, go away and come back, and the trainer
 	cargo build --workspace --locked --bin cpn-planner --bin cpn-trainer
 	cd python/client && $(UV) run --quiet basedpyright && CPN_PROGRAMS=$(CURDIR)/target/debug $(UV) run --quiet pytest
@@ -232,11 +242,11 @@ lint: setup ## Formatting, lints, types
 	cargo clippy --workspace --all-targets --features fuzz/fuzzers --locked -- -D warnings
 	cargo clippy --package planner --package trainer --no-default-features --locked -- -D warnings
 	cd sim-worker && $(UV) run --quiet ruff check $(PYTHON) && $(UV) run --quiet ruff format --check $(PYTHON) && $(UV) run --quiet basedpyright
-	$(UV) tool run --quiet --from buf-bin==1.75.0 buf lint proto
+	for root in proto crates/wire/proto; do $(UV) tool run --quiet --from buf-bin==1.75.0 buf lint $$root || exit 1; done
 
 format: setup ## Lay out all code
 	cargo fmt --all
 	cd sim-worker && $(UV) run --quiet ruff format $(PYTHON)
 
 clean: ## Remove what was built
-	rm -rf target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(VIEW) $(BENCH) $(OPENPI) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch
+	rm -rf target dist $(WORKER) $(EXAMPLES) $(CLIENT) $(EXPORT) $(VIEW) $(BENCH) $(OPENPI) $(TRITON) $(KUBERNETES) $(STACK) $(ADAPTERS:%=%/.venv) $(EXPERIMENT) .libtorch

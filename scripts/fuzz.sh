@@ -6,7 +6,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-fuzzers=(checkpoint messages openpi recording signature)
+fuzzers=(checkpoint kserve messages openpi recording signature)
 RUSTC_WORKSPACE_WRAPPER="$PWD/scripts/rustc-with-coverage.sh" \
     cargo build --workspace --locked --features fuzz/fuzzers "${fuzzers[@]/#/--bin=}"
 

@@ -40,7 +40,7 @@ pub struct GrpcServer {
     /// Listening address.
     pub address: SocketAddr,
     health: HealthReporter,
-    /// Names in the health service: the whole server, and its only service.
+    /// Names in the health service: the whole server, and its main service.
     names: [&'static str; 2],
     stop: CancellationToken,
     task: AbortOnDropHandle<Result<(), tonic::transport::Error>>,
@@ -49,8 +49,8 @@ pub struct GrpcServer {
 }
 
 impl GrpcServer {
-    /// Starts a server of the service `name` with its `routes`, for clients that pass `access` and `allows`. `descriptors` is
-    /// its encoded `FileDescriptorSet`, for reflection. Health is `NOT_SERVING` until [`GrpcServer::ready`].
+    /// Starts a server of `routes`, with those of its main service `name`, for clients that pass `access` and `allows`. `descriptors`
+    /// is its encoded `FileDescriptorSet`, for reflection. Health is `NOT_SERVING` until [`GrpcServer::ready`].
     ///
     /// # Errors
     /// If the address cannot be listened on, or is beyond the loopback interface without TLS.

@@ -96,8 +96,8 @@ pub struct Endpoint {
     pub offered_by: &'static [Role],
     /// Roles that query, subscribe or watch.
     pub used_by: &'static [Role],
-    /// Path of the equivalent gRPC method.
-    pub grpc: Option<&'static str>,
+    /// Paths of the equivalent gRPC methods.
+    pub grpc: &'static [&'static str],
     /// Largest payload, in bytes.
     pub max_bytes: usize,
 }
@@ -117,22 +117,35 @@ const PLANS: &[Role] = &[Evaluator, Client, Operator];
 
 /// All endpoints; access to any other key is denied.
 pub const ENDPOINTS: &[Endpoint] = &[
-    query(|| key::planner_plan("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/Plan"),
-    query(|| key::planner_register_goal("*"), &[Planner], PLANS, "/cpn.v1.PlannerService/RegisterGoal"),
+    query(
+        || key::planner_plan("*"),
+        &[Planner],
+        PLANS,
+        &["/cpn.v1.PlannerService/Plan", "/inference.GRPCInferenceService/ModelInfer"],
+    ),
+    query(|| key::planner_register_goal("*"), &[Planner], PLANS, &["/cpn.v1.PlannerService/RegisterGoal"]),
     Endpoint {
         max_bytes: ListModelsResponse::MAX_BYTES,
         ..query(
             || key::planner_list_models("*"),
             &[Planner],
             &[Evaluator, Client, Operator, Viewer],
-            "/cpn.v1.PlannerService/ListModels",
+            &[
+                "/cpn.v1.PlannerService/ListModels",
+                "/inference.GRPCInferenceService/ServerLive",
+                "/inference.GRPCInferenceService/ServerReady",
+                "/inference.GRPCInferenceService/ServerMetadata",
+                "/inference.GRPCInferenceService/ModelReady",
+                "/inference.GRPCInferenceService/ModelMetadata",
+                "/inference.GRPCInferenceService/ModelConfig",
+            ],
         )
     },
     Endpoint {
         max_bytes: LoadModelRequest::MAX_BYTES,
-        ..query(|| key::planner_load_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/LoadModel")
+        ..query(|| key::planner_load_model("*"), &[Planner], &[Operator], &["/cpn.v1.PlannerService/LoadModel"])
     },
-    query(|| key::planner_unload_model("*"), &[Planner], &[Operator], "/cpn.v1.PlannerService/UnloadModel"),
+    query(|| key::planner_unload_model("*"), &[Planner], &[Operator], &["/cpn.v1.PlannerService/UnloadModel"]),
     zenoh(Kind::Query, || key::sim_reset("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Query, || key::sim_step("*"), &[Worker], &[Evaluator]),
     zenoh(Kind::Publication, || key::sim_frame("*"), &[Worker], &[Viewer]),
@@ -152,14 +165,14 @@ pub const ENDPOINTS: &[Endpoint] = &[
     },
     zenoh(Kind::Query, || key::checkpoint_promote("*"), &[Trainer], &[Operator]),
     zenoh(Kind::Query, || key::checkpoint_roll_back("*"), &[Trainer], &[Operator]),
-    query(|| key::trainer_start_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StartRun"),
-    query(|| key::trainer_stop_run("*"), &[Trainer], &[Operator], "/cpn.v1.TrainerService/StopRun"),
+    query(|| key::trainer_start_run("*"), &[Trainer], &[Operator], &["/cpn.v1.TrainerService/StartRun"]),
+    query(|| key::trainer_stop_run("*"), &[Trainer], &[Operator], &["/cpn.v1.TrainerService/StopRun"]),
     Endpoint {
         max_bytes: ListRunsResponse::MAX_BYTES,
-        ..query(|| key::trainer_list_runs("*"), &[Trainer], &[Operator, Viewer], "/cpn.v1.TrainerService/ListRuns")
+        ..query(|| key::trainer_list_runs("*"), &[Trainer], &[Operator, Viewer], &["/cpn.v1.TrainerService/ListRuns"])
     },
     Endpoint {
-        grpc: Some("/cpn.v1.TrainerService/WatchRun"),
+        grpc: &["/cpn.v1.TrainerService/WatchRun"],
         ..zenoh(Kind::Publication, || key::training_progress("*"), &[Trainer], &[Operator, Viewer])
     },
     zenoh(
@@ -181,21 +194,21 @@ const fn zenoh(
     offered_by: &'static [Role],
     used_by: &'static [Role],
 ) -> Endpoint {
-    Endpoint { kind, key, offered_by, used_by, grpc: None, max_bytes: PlanRequest::MAX_BYTES }
+    Endpoint { kind, key, offered_by, used_by, grpc: &[], max_bytes: PlanRequest::MAX_BYTES }
 }
 
 const fn query(
     key: fn() -> Result<OwnedKeyExpr, Error>,
     offered_by: &'static [Role],
     used_by: &'static [Role],
-    grpc: &'static str,
+    grpc: &'static [&'static str],
 ) -> Endpoint {
-    Endpoint { grpc: Some(grpc), ..zenoh(Kind::Query, key, offered_by, used_by) }
+    Endpoint { grpc, ..zenoh(Kind::Query, key, offered_by, used_by) }
 }
 
 /// Whether an identity may call the gRPC method at `path`.
 pub fn may_call(identity: &str, path: &str) -> bool {
-    let endpoint = ENDPOINTS.iter().find(|endpoint| endpoint.grpc == Some(path));
+    let endpoint = ENDPOINTS.iter().find(|endpoint| endpoint.grpc.contains(&path));
     endpoint.zip(Role::of(identity)).is_some_and(|(endpoint, role)| endpoint.used_by.contains(&role))
 }
 

@@ -25,6 +25,12 @@ pub use image::Image;
 pub use message::{Message, decode, encode};
 pub use observation::{Observation, Position};
 
+/// The generated types of the Open Inference Protocol.
+#[allow(missing_docs, clippy::all, reason = "generated code")]
+pub mod inference {
+    tonic::include_proto!("inference");
+}
+
 /// The generated protobuf types.
 #[allow(missing_docs, clippy::all, reason = "generated code")]
 pub mod proto {

@@ -1,7 +1,7 @@
 //! Requests and responses of the planner service.
 
 use crate::message::{action, digest, name, required};
-pub use crate::search::{Search, Solver};
+pub use crate::search::{MAX_ITERATIONS, Search, Solver};
 use crate::{Error, Image, Message, Observation, Position, proto};
 use std::time::Duration;
 

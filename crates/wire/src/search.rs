@@ -3,7 +3,7 @@
 use crate::{Error, proto};
 
 /// Largest number of iterations in a request.
-const MAX_ITERATIONS: u32 = 1000;
+pub const MAX_ITERATIONS: u32 = 1000;
 /// Largest number of samples per iteration.
 const MAX_SAMPLES: u32 = 4096;
 

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::goals::Goals;
-use crate::model::{Computing, Model, RANDOM};
+use crate::model::{Computing, Description, Model, RANDOM};
 use crate::model_thread::ModelThread;
 use crate::served::{check_capacity, unknown_model};
 use crate::signatures::Signatures;
@@ -223,7 +223,16 @@ impl PlannerCore {
 
     /// Served models, ordered by name.
     pub fn list_models(&self) -> ListModelsResponse {
-        ListModelsResponse { models: self.thread.models().values().cloned().collect() }
+        ListModelsResponse { models: self.thread.models().values().map(|model| model.info.clone()).collect() }
+    }
+
+    /// Description of a served model.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` for an unknown name.
+    pub(crate) fn describe(&self, model: &str) -> Result<Description, Error> {
+        let models = self.thread.models();
+        models.get(model).cloned().ok_or_else(|| unknown_model(model, models.keys()))
     }
 
     /// Ends searches in progress, with an error.

@@ -2,17 +2,20 @@
 
 use crate::CHANGES;
 use crate::core::PlannerCore;
+use crate::kserve::Inference;
 use service_kit::GrpcServer;
 use service_kit::access::Access;
 use service_kit::listener::ListenConfig;
 use std::future::ready;
+use tonic::metadata::MetadataMap;
 use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status};
 use tower::util::MapResponseLayer;
-use tracing::{Instrument, debug_span};
+use tracing::{Instrument, Span, debug_span};
 use wire::access::may_call;
 use wire::grpc::{answer, name_unreadable_payload};
+use wire::inference::grpc_inference_service_server::GrpcInferenceServiceServer;
 use wire::planner::{LoadModelRequest, PlanRequest};
 use wire::proto::planner_service_server::{PlannerService, PlannerServiceServer};
 use wire::trace::TRACEPARENT;
@@ -27,7 +30,9 @@ const LOAD_MODEL_PATH: &str = "/cpn.v1.PlannerService/LoadModel";
 /// If the address cannot be listened on, or is beyond the loopback interface without TLS.
 pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Access) -> anyhow::Result<GrpcServer> {
     let service = |limit| PlannerServiceServer::new(Grpc(core.clone())).max_decoding_message_size(limit);
+    let inference = GrpcInferenceServiceServer::new(Inference(core.clone()));
     let planner = Routes::new(service(PlanRequest::MAX_BYTES))
+        .add_service(inference.max_decoding_message_size(PlanRequest::MAX_BYTES))
         .into_axum_router()
         .route_service(LOAD_MODEL_PATH, service(LoadModelRequest::MAX_BYTES))
         .layer(MapResponseLayer::new(name_unreadable_payload));
@@ -36,15 +41,21 @@ pub(crate) async fn start(core: PlannerCore, listen: ListenConfig, access: Acces
     GrpcServer::start(listen, (access, may_call), name, proto::DESCRIPTORS, Routes::from(planner)).await
 }
 
+/// Span of a request for a plan, in the trace of its client.
+pub(crate) fn request_span(metadata: &MetadataMap, key: &'static str) -> Span {
+    let span = debug_span!("request", otel.kind = "server", key);
+    let parent = metadata.get(TRACEPARENT).and_then(|value| value.to_str().ok());
+    trace::follow(&span, parent);
+    span
+}
+
 /// Implementation of the generated service.
 struct Grpc(PlannerCore);
 
 #[tonic::async_trait]
 impl PlannerService for Grpc {
     async fn plan(&self, request: Request<proto::PlanRequest>) -> Result<Response<proto::PlanResponse>, Status> {
-        let span = debug_span!("request", otel.kind = "server", key = "PlannerService/Plan");
-        let parent = request.metadata().get(TRACEPARENT).and_then(|value| value.to_str().ok());
-        trace::follow(&span, parent);
+        let span = request_span(request.metadata(), "PlannerService/Plan");
         answer(request, |request| self.0.plan(request)).instrument(span).await
     }
 

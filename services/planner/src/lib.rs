@@ -1,6 +1,6 @@
-//! Planner service: plans from trained weights over zenoh, gRPC and openpi's protocol.
+//! Planner service: plans from trained weights over zenoh, gRPC, the Open Inference Protocol and openpi's protocol.
 //!
-//! [`core`] is the service without transports; `grpc`, `zenoh` and `openpi` only translate. One thread at a time (`model_thread`,
+//! [`core`] is the service without transports; `grpc`, `kserve`, `zenoh` and `openpi` only translate. One thread at a time (`model_thread`,
 //! `owner`) owns all models ([`model`]) and plans queued requests in batches; `goals` stores the registered goals. A model is
 //! swapped between two plans, and only for one that has been warmed up.
 
@@ -9,6 +9,7 @@ pub mod core;
 mod follow;
 mod goals;
 mod grpc;
+mod kserve;
 mod load;
 pub mod model;
 mod model_thread;
@@ -25,6 +26,8 @@ use crate::core::PlannerCore;
 use crate::openpi::OpenpiServer;
 use crate::zenoh::ZenohServer;
 pub use config::Config;
+#[doc(hidden)]
+pub use kserve::request as kserve_request; // for the fuzzer
 #[doc(hidden)]
 pub use openpi::request as openpi_request; // for the fuzzer
 use service_kit::access::Access;

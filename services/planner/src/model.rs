@@ -42,11 +42,34 @@ pub struct Model {
     pub(crate) costs: Costs,
 }
 
+/// Description of a served model, for transports that tell its inputs and outputs.
+#[derive(Debug, Clone)]
+pub(crate) struct Description {
+    /// Description for clients.
+    pub(crate) info: ModelInfo,
+    /// Kind of observations and goals; images for a method that takes both.
+    pub(crate) input: Input,
+    /// A, the number of continuous actions.
+    pub(crate) actions: usize,
+    /// Whether plans depend on the number of steps left.
+    pub(crate) takes_steps_left: bool,
+}
+
 impl Model {
     /// Model of a method, served as `info` describes.
     pub fn new(info: ModelInfo, render_spec: String, method: Box<dyn Method>) -> Self {
         let costs = Costs::new(&info.digest, method.updates().unwrap_or_default());
         Self { info, render_spec, method, costs }
+    }
+
+    /// Description of the model.
+    pub(crate) fn describe(&self) -> Description {
+        Description {
+            info: self.info.clone(),
+            input: if self.method.takes(Input::Image) { Input::Image } else { Input::Position },
+            actions: self.method.actions(),
+            takes_steps_left: self.method.takes_steps_left(),
+        }
     }
 
     /// Random baseline: uniform actions, independent of the observation.

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::load::{Estimate, Load};
-use crate::model::Model;
+use crate::model::{Description, Model};
 use crate::outbox::{Outbox, STALL_TIMEOUT};
 use crate::owner::{Owner, Step};
 use crate::task::{
@@ -19,7 +19,6 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use tokio_util::task::AbortOnDropHandle;
 use tracing::{debug_span, warn};
 use wire::Error;
-use wire::planner::ModelInfo;
 
 /// Handle of the model thread.
 #[derive(Debug, Clone)]
@@ -33,7 +32,7 @@ pub(crate) struct ModelThread {
     load: Arc<Load>,
     leadership: Leadership,
     outbox: Outbox,
-    models: watch::Receiver<BTreeMap<String, ModelInfo>>,
+    models: watch::Receiver<BTreeMap<String, Description>>,
 }
 
 /// State of the leader, the thread that owns the models.
@@ -58,8 +57,8 @@ impl ModelThread {
     /// If the thread cannot be started.
     pub(crate) fn start(config: &Config, models: Vec<Model>) -> io::Result<Self> {
         let (sender, receiver) = mpsc::channel();
-        let infos = models.iter().map(|model| (model.info.name.clone(), model.info.clone())).collect();
-        let (published, subscribed) = watch::channel(infos);
+        let descriptions = models.iter().map(|model| (model.info.name.clone(), model.describe())).collect();
+        let (published, subscribed) = watch::channel(descriptions);
         let load = Arc::new(Load::default());
         let owner = Owner::new(config, models, published, Arc::clone(&load));
 
@@ -190,7 +189,7 @@ impl ModelThread {
     }
 
     /// Served models, by name.
-    pub(crate) fn models(&self) -> watch::Ref<'_, BTreeMap<String, ModelInfo>> {
+    pub(crate) fn models(&self) -> watch::Ref<'_, BTreeMap<String, Description>> {
         self.models.borrow()
     }
 

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::load::{Load, SLICE, resolve};
-use crate::model::Model;
+use crate::model::{Description, Model};
 use crate::model_thread::Job;
 use crate::searches::Searches;
 use crate::served::Served;
@@ -17,7 +17,7 @@ use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tracing::{debug_span, error};
-use wire::planner::{ModelInfo, StageTimes};
+use wire::planner::StageTimes;
 use wire::{Code, Error};
 
 /// Longest estimated time of a batch whose requests choose a search, so that other tasks do not wait long.
@@ -31,7 +31,7 @@ pub(crate) struct Owner {
     /// Jobs received from the channel and not done yet, in order.
     queue: VecDeque<Job>,
     searches: Searches,
-    published: watch::Sender<BTreeMap<String, ModelInfo>>,
+    published: watch::Sender<BTreeMap<String, Description>>,
     load: Arc<Load>,
     batch_size: usize,
     batch_delay: Duration,
@@ -57,7 +57,7 @@ impl Owner {
     pub(crate) fn new(
         config: &Config,
         models: Vec<Model>,
-        published: watch::Sender<BTreeMap<String, ModelInfo>>,
+        published: watch::Sender<BTreeMap<String, Description>>,
         load: Arc<Load>,
     ) -> Self {
         let mut served = Served::new(config.model_capacity.get().into(), config.retired_capacity.into());
@@ -118,17 +118,18 @@ impl Owner {
     }
 
     fn serve(&mut self, model: Model) -> Result<(), Error> {
-        let (info, costs) = (model.info.clone(), model.costs.clone());
+        let (description, costs) = (model.describe(), model.costs.clone());
+        let name = description.info.name.clone();
         self.models.swap_in(model)?;
-        self.load.register(&info.name, costs);
-        self.published.send_modify(|infos| drop(infos.insert(info.name.clone(), info)));
+        self.load.register(&name, costs);
+        self.published.send_modify(|models| drop(models.insert(name, description)));
         Ok(())
     }
 
     fn unload(&mut self, model: &str) -> Result<(), Error> {
         self.models.remove(model)?;
         self.load.forget(model);
-        self.published.send_modify(|infos| drop(infos.remove(model)));
+        self.published.send_modify(|models| drop(models.remove(model)));
         Ok(())
     }
 

@@ -17,6 +17,7 @@ fn the_readme_quotes_one_example_and_links_the_others() {
         "examples/plan_zenoh.py",
         "examples/plan_grpc.py",
         "examples/plan_openpi.py",
+        "examples/plan_triton.py",
         "services/planner/examples/plan.rs",
     ] {
         assert!(

@@ -33,7 +33,7 @@ async fn a_ready_planner_is_healthy_and_describes_itself() {
         panic!("expected a list of services");
     };
     let names: Vec<_> = list.service.into_iter().map(|service| service.name).collect();
-    for name in ["cpn.v1.PlannerService", "grpc.health.v1.Health"] {
+    for name in ["cpn.v1.PlannerService", "grpc.health.v1.Health", "inference.GRPCInferenceService"] {
         assert!(names.iter().any(|n| n == name), "{names:?}");
     }
 }

@@ -7,6 +7,7 @@ mod common;
 mod config;
 mod contract;
 mod examples;
+mod kserve;
 mod lifecycle;
 mod malformed;
 mod metrics;

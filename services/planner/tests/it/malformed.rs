@@ -48,6 +48,7 @@ async fn raw_grpc(channel: &Channel, method: &'static str, bytes: Vec<u8>) -> Re
 
 const PLAN: &str = "/cpn.v1.PlannerService/Plan";
 const LOAD_MODEL: &str = "/cpn.v1.PlannerService/LoadModel";
+const INFER: &str = "/inference.GRPCInferenceService/ModelInfer";
 
 fn assert_refused(error: Error, what: &str) {
     assert_eq!((error.code, error.field.as_str()), (Code::InvalidArgument, "payload"), "{what}: {error}");
@@ -63,7 +64,9 @@ async fn malformed_messages_are_refused() {
     let key = key::planner_plan(NAME).unwrap();
     let [_, grpc @ Client::Grpc(_), zenoh @ Client::Zenoh(_)] = fixture.clients() else { unreachable!() };
     for (what, bytes) in [("truncated", truncated), ("a name that is no text", not_text), ("endless", endless)] {
-        assert_refused(raw_grpc(&fixture.channel, PLAN, bytes.clone()).await.unwrap_err(), what);
+        for method in [PLAN, INFER] {
+            assert_refused(raw_grpc(&fixture.channel, method, bytes.clone()).await.unwrap_err(), what);
+        }
         assert_refused(raw_query::<PlanResponse>(&fixture.session, &key, Some(bytes)).await.unwrap_err(), what);
         grpc.plan(plan_request(RANDOM, 3)).await.unwrap();
         zenoh.plan(plan_request(RANDOM, 3)).await.unwrap();

@@ -23,6 +23,8 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Identity};
 use tonic::{Code, Request};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
+use wire::inference::grpc_inference_service_client::GrpcInferenceServiceClient;
+use wire::inference::{ModelInferRequest, ServerLiveRequest};
 use wire::proto;
 use wire::proto::planner_service_client::PlannerServiceClient;
 
@@ -108,6 +110,14 @@ impl Secure {
         [listed, loaded]
     }
 
+    /// Status codes of `ServerLive` and `ModelInfer`, an empty request.
+    async fn inference_codes(&self, identity: Option<&str>) -> [Code; 2] {
+        let mut planner = GrpcInferenceServiceClient::new(self.channel(identity).await.unwrap());
+        let live = planner.server_live(ServerLiveRequest {}).await.map_or_else(|status| status.code(), |_| Code::Ok);
+        let inferred = planner.model_infer(ModelInferRequest::default()).await;
+        [live, inferred.map_or_else(|status| status.code(), |_| Code::Ok)]
+    }
+
     async fn stream(&self, address: SocketAddr, identity: &str) -> TlsStream<TcpStream> {
         let connector = TlsConnector::from(Arc::new(self.tls(identity).client().unwrap()));
         let stream = TcpStream::connect(address).await.unwrap();
@@ -144,6 +154,10 @@ async fn clients_are_authorised_by_role() {
     assert_eq!(secure.codes(None, Some(&token)).await, [Code::Ok, Code::PermissionDenied]);
     assert_eq!(secure.codes(None, Some("guessed")).await, missing);
     assert_eq!(secure.codes(None, None).await, missing);
+    assert_eq!(secure.inference_codes(Some("client")).await, [Code::Ok, Code::InvalidArgument]);
+    assert_eq!(secure.inference_codes(Some("viewer")).await, [Code::Ok, Code::PermissionDenied]);
+    assert_eq!(secure.inference_codes(Some("worker")).await, [Code::PermissionDenied; 2]);
+    assert_eq!(secure.inference_codes(None).await, missing);
     // Orchestrators check health without credentials.
     let mut health = HealthClient::new(secure.channel(None).await.unwrap());
     health.check(HealthCheckRequest { service: "zenoh".into() }).await.unwrap();
@@ -185,9 +199,9 @@ async fn clients_are_authorised_by_role() {
     assert!(refused.starts_with("HTTP/1.1 403"), "{refused}");
     let metrics = secure.scrape("viewer").await;
     for line in [
-        "cpn_access_refused_total{reason=\"missing\"} 2",
+        "cpn_access_refused_total{reason=\"missing\"} 4",
         "cpn_access_refused_total{reason=\"unknown\"} 3",
-        "cpn_access_refused_total{reason=\"forbidden\"} 6",
+        "cpn_access_refused_total{reason=\"forbidden\"} 9",
         "cpn_zenoh_connected 1",
     ] {
         assert!(metrics.lines().any(|found| found == line), "{line}: not in\n{metrics}");
