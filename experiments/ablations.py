@@ -46,7 +46,9 @@ ACCURATE = {"training.losses.position": 30}
 """Weight of the position loss by which positions in images of the development tasks are most accurate."""
 
 DEFAULT = "default"
-"""Number of updates that the planner chooses: no option."""
+"""Number of updates that the planner chooses, straight towards the goal."""
+APPROACHES = "approaches"
+"""The same, with approaches: no option."""
 CONTROLS = ("no-op", "oracle")
 """Controls of the evaluator."""
 
@@ -61,7 +63,7 @@ class Arm:
     noise: float = 0
     """Noise injection of the demonstrations."""
     updates: tuple[int | str, ...] = (0, 1, 5)
-    """Numbers of updates to plan with, of a method that plans; `DEFAULT` for the planner's choice."""
+    """Numbers of updates to plan with, of a method that plans; `DEFAULT` and `APPROACHES` for the planner's choice."""
 
     @property
     def dataset(self) -> Path:
@@ -88,7 +90,7 @@ ARMS = {
     "position-te-bc": Arm(POSITION, "te-bc"),
     "position-dynamics": Arm(POSITION_DYNAMICS, updates=(0, 1, 2, 5, 20)),
     "accurate-position-dynamics": Arm(POSITION_DYNAMICS | ACCURATE, updates=(0, 1, 2, 5, 20)),
-    "familiar-goals": Arm(POSITION_DYNAMICS | ACCURATE | {"model.familiar_goals": 1024}, updates=(DEFAULT,)),
+    "familiar-goals": Arm(POSITION_DYNAMICS | ACCURATE | {"model.familiar_goals": 1024}, updates=(DEFAULT, APPROACHES)),
     "noise-te-bc": Arm(NOISY_EPOCHS, "te-bc", NOISE),
     "noise-augmented-te-bc": Arm(NOISY_EPOCHS | AUGMENTED, "te-bc", NOISE),
     "noise-paper": Arm(NOISY_EPOCHS, noise=NOISE),
@@ -103,9 +105,10 @@ REPORTED_ARMS = {
     "paper": (1,),
     "position-dynamics": (0, 5),
     "accurate-position-dynamics": (0, 5),
+    "familiar-goals": (DEFAULT, APPROACHES),
 }
 """Arms that are run on the reported tasks, with their numbers of updates."""
-BEST = ("accurate-position-dynamics", "5")
+BEST = ("familiar-goals", APPROACHES)
 """Arm and number of updates that the others are compared with."""
 SEEDS = (0, 1)
 TRIALS = 20
@@ -162,9 +165,15 @@ def run(cell: Cell) -> None:
         lab.worker("w0")
         search = ["--models", recipe.method, "--tasks", ",".join(cell.tasks), "--trials", str(TRIALS)]
         for updates in cell.updates:
-            choice = ["--updates", str(updates)] if recipe.plans and updates != DEFAULT else []
-            lab.evaluate(*search, *choice, "--out", str(out / f"updates-{updates}"))
+            lab.evaluate(*search, *_planning(recipe, updates), "--out", str(out / f"updates-{updates}"))
     keep(cell, out)
+
+
+def _planning(recipe: Arm, updates: int | str) -> list[str]:
+    """Options of an evaluation for plans with a number of updates."""
+    if updates == APPROACHES or not recipe.plans:
+        return []
+    return ["--no-approaches"] if updates == DEFAULT else ["--updates", str(updates)]
 
 
 def keep(cell: Cell, out: Path) -> None:
@@ -252,7 +261,9 @@ def _reported(seeds: Iterable[int]) -> dict[tuple[str, str], dict[str, list[int]
 
 def _name(arm: str, updates: str) -> str:
     """Heading of a column."""
-    return f"{arm}, U = {updates}" if ARMS[arm].plans else arm
+    if not ARMS[arm].plans:
+        return arm
+    return f"{arm}, U = {updates}" if updates.isdigit() else f"{arm}, {updates}"
 
 
 def _count(by_task: dict[str, list[int]], tasks: tuple[str, ...]) -> tuple[int, int]:

@@ -252,11 +252,12 @@ def test_episode_keeps_seed_warm_start_approach_and_checkpoint(connect: Connect,
         planner = connect(address)
         with planner.episode(GOAL, model="m", seed=7, warm_start=True) as episode:
             actions = [episode.act(FRAME, steps_left=left) for left in (3, 2)]
-        with planner.episode((0.5, 0.25, 1), model="m") as episode:
-            for _ in range(2):
-                episode.act([0, 0.5, 1])
+        for approaches in (True, False):
+            with planner.episode((0.5, 0.25, 1), model="m", approaches=approaches) as episode:
+                for _ in range(2):
+                    episode.act([0, 0.5, 1])
     assert actions == [(0.25, 7.0), (0.25, 8.0)]
-    first, second, cold, later = requests
+    first, second, cold, later, _, direct = requests
     assert (first.seed, first.model_digest, first.steps_left) == (7, "", 3)
     assert first.goal_image.data == cpn_client.Image.of(GOAL).data
     assert (second.seed, second.model_digest, second.steps_left) == (8, "d" * 64, 2)
@@ -266,5 +267,5 @@ def test_episode_keeps_seed_warm_start_approach_and_checkpoint(connect: Connect,
     assert (later.position.x, later.position.y, later.position.z) == (0, 0.5, 1)
     assert not cold.warm_start
     assert not later.warm_start
-    assert [request.HasField("approach") for request in requests] == [False, False, False, True]
+    assert not any(request.HasField("approach") for request in (first, second, cold, direct))
     assert (later.approach.tried, list(later.approach.position), later.approach.plans) == (1, [0, 0.5, 1], 0)

@@ -118,7 +118,7 @@ impl Planned<'_> {
         let actions = std::iter::once(response.first_action.clone()).chain(later).collect();
         if self.planning.warm_start {
             self.warm_start = moved_on(response.warm_start.clone(), applied - 1);
-        } else {
+        } else if !self.planning.no_approaches {
             self.approach = response.approach;
         }
         let times = response.times;

@@ -26,6 +26,10 @@ pub struct Planning {
     /// Start each search from the plan before, moved on by the applied actions.
     #[arg(long)]
     pub warm_start: bool,
+    /// Plan straight towards the goal, also where the hand stalls.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub no_approaches: bool,
     /// Number of actions of each plan that are applied before the next plan; at most the horizon.
     #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
     pub apply_actions: u32,
@@ -48,6 +52,7 @@ impl Default for Planning {
             updates: None,
             samples: None,
             warm_start: false,
+            no_approaches: false,
             apply_actions: 1,
             real_time: false,
             task_steps: None,
@@ -89,12 +94,13 @@ impl Planning {
 /// The options that were given, as they are typed.
 impl fmt::Display for Planning {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { solver, updates, samples, warm_start, apply_actions, real_time, task_steps } = self;
+        let Self { solver, updates, samples, warm_start, no_approaches, apply_actions, real_time, task_steps } = self;
         let options = [
             solver.and_then(|solver| Some(format!("--solver {}", solver.to_possible_value()?.get_name()))),
             updates.map(|updates| format!("--updates {updates}")),
             samples.map(|samples| format!("--samples {samples}")),
             warm_start.then(|| "--warm-start".into()),
+            no_approaches.then(|| "--no-approaches".into()),
             (*apply_actions != 1).then(|| format!("--apply-actions {apply_actions}")),
             real_time.then(|| "--real-time".into()),
             task_steps.map(|steps| format!("--task-steps {steps}")),

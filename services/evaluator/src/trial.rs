@@ -473,6 +473,7 @@ mod tests {
         };
         assert_eq!(approaches(recording), [None; 3]);
         assert_eq!(approaches(planned(default).await.2), [None, Some(1), Some(2)]);
+        assert_eq!(approaches(planned(Planning { no_approaches: true, ..default }).await.2), [None; 3]);
         // Two actions of the first plan, then the second plan, from the third action on.
         let (applied, steps, recording) = planned(Planning { apply_actions: 2, warm_start: true, ..default }).await;
         assert_eq!((applied, steps, recording.exchanges().len()), (vec![0, 1, 2], vec![0, 2], 2));

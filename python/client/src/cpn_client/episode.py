@@ -26,6 +26,7 @@ class _Steps:
         model: str,
         seed: int,
         warm_start: bool,
+        approaches: bool,
         deadline_ms: int | None,
         search: Search | None,
         with_fallback: Sequence[float] | None,
@@ -40,6 +41,7 @@ class _Steps:
         self._settings = {"model": model, "deadline_ms": deadline_ms, "search": search}
         self._seed = seed
         self._warm_start = warm_start
+        self._approaches = approaches and not warm_start
         self._fallback = None if with_fallback is None else tuple(float(value) for value in with_fallback)
 
     def __exit__(self, *_: object) -> None:
@@ -54,7 +56,7 @@ class _Steps:
             "observation": frame,
             "seed": self._seed + self.steps,
             "warm_start": last.warm_start if last and self._warm_start else (),
-            "approach": last.approach if last and not self._warm_start else None,
+            "approach": last.approach if last and self._approaches else None,
             "model_digest": last.model_digest if last else "",
             "steps_left": steps_left,
         }

@@ -113,6 +113,7 @@ class Planner:
         model: str,
         seed: int = 0,
         warm_start: bool = False,
+        approaches: bool = True,
         deadline_ms: int | None = None,
         search: Search | None = None,
         with_fallback: Sequence[float] | None = None,
@@ -125,6 +126,9 @@ class Planner:
             seed: Seed of the first plan; each step adds one.
             warm_start: Whether each search starts from the plan before, moved on by one step, in place of the policy's
                 plan: for searches of many iterations.
+            approaches: Whether, with a model of position dynamics, an episode without a search and warm starts tries the
+                sides of the goal in turn where the hand stalls. False for an arm that must rest at the goal: the planner
+                is not told of success.
             deadline_ms: Longest wait for an action, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             with_fallback: Action, [A], in place of one that is late or whose planner is away or too busy; None for the
@@ -139,6 +143,7 @@ class Planner:
             model=model,
             seed=seed,
             warm_start=warm_start,
+            approaches=approaches,
             deadline_ms=deadline_ms,
             search=search,
             with_fallback=with_fallback,
@@ -211,6 +216,7 @@ class AsyncPlanner:
         model: str,
         seed: int = 0,
         warm_start: bool = False,
+        approaches: bool = True,
         deadline_ms: int | None = None,
         search: Search | None = None,
         with_fallback: Sequence[float] | None = None,
@@ -222,6 +228,7 @@ class AsyncPlanner:
             model=model,
             seed=seed,
             warm_start=warm_start,
+            approaches=approaches,
             deadline_ms=deadline_ms,
             search=search,
             with_fallback=with_fallback,
