@@ -1,4 +1,4 @@
-//! Approaches of an episode: targets for the hand, one after the other, where it stalls before the task is solved.
+//! Approach of an episode: progress of the hand through targets, the next one where it stalls.
 
 /// Standard deviations within which the hand is at its target, and beyond which it has moved.
 const RADIUS: f32 = 0.1;
@@ -8,13 +8,15 @@ const OFFSET: f32 = 1.0;
 const PATIENCE: u32 = 8;
 /// The same under the policy's plans, which rest to grasp.
 const POLICY_PATIENCE: u32 = 24;
+/// Largest absolute value of a position that is kept, in standard deviations.
+const MAX_POSITION: f32 = 1000.0;
 /// Sides of the goal to come from, in turn: left, below, above, right, front and back in Meta-World.
 const SIDES: [[f32; 3]; 6] =
     [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]];
 
-/// Progress of an episode's hand towards its targets, of a model with position dynamics. The targets are, for a familiar goal,
-/// first what the policy does; then the goal's position, and by turns a position beside it and the goal's again. The next target
-/// begins when the hand is at the last or has stalled, as a progress checker of navigation (Nav2) finds it.
+/// Progress of an episode's hand through its targets, of a model with position dynamics. The targets are, for a familiar goal, first the
+/// ends of the policy's plans; then the goal's position, and by turns a position beside it and the goal's again. The next target begins
+/// when the hand is at the last or has stalled: the progress check of navigation (Nav2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Approach {
     /// Number of targets that were reached or given up.
@@ -28,7 +30,7 @@ pub struct Approach {
 /// Target of the hand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Target {
-    /// Where the policy's plans lead.
+    /// Ends of the policy's plans.
     Policy,
     /// The goal's position.
     Goal,
@@ -49,13 +51,14 @@ impl Approach {
         let patience = if target == Target::Policy { POLICY_PATIENCE } else { PATIENCE };
         let has_arrived = target.position(x_g).is_some_and(|target| distance(hand, target) <= RADIUS);
         let has_moved = distance(hand, self.position) > RADIUS;
+        let plans = self.plans.saturating_add(1);
 
-        if has_arrived || (!has_moved && self.plans + 1 >= patience) {
+        if has_arrived || (!has_moved && plans >= patience) {
             Self { tried: self.tried.saturating_add(1), position: hand, plans: 0 }
         } else if has_moved {
             Self { position: hand, plans: 0, ..self }
         } else {
-            Self { plans: self.plans + 1, ..self }
+            Self { plans, ..self }
         }
     }
 
@@ -98,9 +101,9 @@ impl Target {
     }
 }
 
-/// Position in an embedding.
+/// Position in an embedding, within the bounds of [`Approach::position`].
 fn position(x: &[f32]) -> [f32; 3] {
-    [x[0], x[1], x[2]]
+    [x[0], x[1], x[2]].map(|value| value.clamp(-MAX_POSITION, MAX_POSITION))
 }
 
 fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
@@ -133,6 +136,8 @@ mod tests {
         let again = Approach { tried: round + 1, ..approach };
         assert_eq!(again.towards(&GOAL, false), targets[1]);
         assert_eq!(rest(Approach { tried: u32::MAX, ..approach }, far, true, PATIENCE).tried, u32::MAX);
+        assert_eq!(Approach { plans: u32::MAX, ..Approach::first(&far) }.next(&far, &GOAL, false).tried, 1);
+        assert_eq!(Approach::first(&[-2000.0, 0.0, 2000.0]).position, [-1000.0, 0.0, 1000.0]);
     }
 
     #[test]

@@ -50,7 +50,7 @@ pub struct PlanRequest {
     pub approach: Option<Approach>,
 }
 
-/// Progress of an episode's hand towards its targets.
+/// Progress of an episode's hand through its targets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Approach {
     /// Number of targets that were reached or given up.

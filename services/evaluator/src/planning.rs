@@ -28,7 +28,7 @@ pub struct Planning {
     pub warm_start: bool,
     /// Plan straight towards the goal, also where the hand stalls.
     #[arg(long)]
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default = "straight")]
     pub no_approaches: bool,
     /// Number of actions of each plan that are applied before the next plan; at most the horizon.
     #[arg(long, default_value_t = 1, value_parser = value_parser!(u32).range(1..))]
@@ -60,10 +60,20 @@ impl Default for Planning {
     }
 }
 
+/// `no_approaches` of a record without it, from before there were approaches.
+fn straight() -> bool {
+    true
+}
+
 impl Planning {
     /// Whether everything is as by default.
     pub(crate) fn is_default(&self) -> bool {
         *self == Self::default()
+    }
+
+    /// Settings of a record without any: the default from before there were approaches.
+    pub(crate) fn of_old_record() -> Self {
+        Self { no_approaches: straight(), ..Self::default() }
     }
 
     /// The search that models that plan are asked for; none if it is theirs.
@@ -142,7 +152,8 @@ mod tests {
 
     #[test]
     fn records_without_settings_are_of_the_default() {
-        assert_eq!(serde_json::from_str::<Planning>("{}").unwrap(), Planning::default());
+        assert_eq!(serde_json::from_str::<Planning>("{}").unwrap(), Planning::of_old_record());
+        assert_eq!(Planning::of_old_record().to_string(), "--no-approaches");
         assert_eq!(Planning::default().search(), None);
         let planning = Planning { updates: Some(0), warm_start: true, task_steps: Some(70), ..Planning::default() };
         let json = serde_json::to_string(&planning).unwrap();

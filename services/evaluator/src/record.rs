@@ -43,7 +43,7 @@ pub struct Run {
     /// Source of the goals.
     pub goal: GoalSource,
     /// Settings of plans in closed loop.
-    #[serde(default, skip_serializing_if = "Planning::is_default")]
+    #[serde(default = "Planning::of_old_record")]
     pub planning: Planning,
 }
 
@@ -128,7 +128,7 @@ pub struct Trial {
     /// Source of the goal.
     pub goal: GoalSource,
     /// Settings of plans in closed loop.
-    #[serde(default, skip_serializing_if = "Planning::is_default")]
+    #[serde(default = "Planning::of_old_record")]
     pub planning: Planning,
     /// Outcome.
     #[serde(flatten)]

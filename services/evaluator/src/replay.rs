@@ -127,6 +127,9 @@ fn compare(step: usize, Exchange { request, response, .. }: &Exchange, mut now: 
     if recorded.iterations != now.iterations {
         return difference("iterations".into(), recorded.iterations.to_string(), now.iterations.to_string());
     }
+    if recorded.approach != now.approach {
+        return difference("approach".into(), format!("{:?}", recorded.approach), format!("{:?}", now.approach));
+    }
     None
 }
 
@@ -146,7 +149,7 @@ fn values(plan: &PlanResponse) -> Vec<(String, &[f32])> {
 mod tests {
     use super::*;
     use wire::Position;
-    use wire::planner::{Solver, StageTimes};
+    use wire::planner::{Approach, Solver, StageTimes};
 
     fn exchange(search: Option<Search>) -> Exchange {
         let position = Position::new([0.0; 3]).unwrap();
@@ -206,7 +209,7 @@ mod tests {
             spoil(&mut now);
             compare(3, &recorded, now).map(|found| Replay { plans: 9, difference: Some(found) }.to_string())
         };
-        let cases: [(Spoil, &str); 9] = [
+        let cases: [(Spoil, &str); 10] = [
             (|now| now.actions[1][2] = -0.0, "actions[1][2]: recorded 0, now -0"),
             (|now| now.actions[1][0] = 0.5f32.next_up(), "actions[1][0]: recorded 0.5, now 0.50000006"),
             (|now| drop(now.actions.pop()), "actions[1]: recorded 3 values, now 0 values"),
@@ -216,6 +219,10 @@ mod tests {
             (|now| now.latent_distance = None, "latent_distance: recorded 1 values, now 0 values"),
             (|now| now.latent_distance = Some(4.5), "latent_distance[0]: recorded 4, now 4.5"),
             (|now| now.iterations = 3, "iterations: recorded 2, now 3"),
+            (
+                |now| now.approach = Some(Approach { tried: 1, position: [0.0; 3], plans: 2 }),
+                "approach: recorded None, now Some(Approach { tried: 1, position: [0.0, 0.0, 0.0], plans: 2 })",
+            ),
         ];
         for (spoil, expected) in cases {
             assert_eq!(difference(spoil).unwrap(), format!("step 3 of 9: {expected}"));

@@ -337,7 +337,7 @@ mod tests {
                     goal_id: image(255).digest(),
                     iterations: 0,
                     iterations_run: request.search.map_or(0, |search| search.iterations.unwrap_or_default()),
-                    approach: Some(Approach {
+                    approach: request.search.is_none().then(|| Approach {
                         tried: 0,
                         position: [0.0; 3],
                         plans: request.approach.map_or(1, |approach| approach.plans + 1),
@@ -469,7 +469,11 @@ mod tests {
         assert!(recording.exchanges().iter().all(|exchange| exchange.request.search.is_none()));
         // An approach goes on with each plan, but not beside a warm start.
         let approaches = |recording: Recording| -> Vec<_> {
-            recording.exchanges().iter().map(|exchange| exchange.request.approach.map(|approach| approach.plans)).collect()
+            recording
+                .exchanges()
+                .iter()
+                .map(|exchange| exchange.request.approach.map(|approach| approach.plans))
+                .collect()
         };
         assert_eq!(approaches(recording), [None; 3]);
         assert_eq!(approaches(planned(default).await.2), [None, Some(1), Some(2)]);

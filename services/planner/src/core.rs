@@ -95,8 +95,18 @@ impl PlannerCore {
 
     /// Resolves the names in a request and checks its images.
     fn task(&self, request: PlanRequest) -> Result<PlanTask, Error> {
-        let PlanRequest { model, goal, observation, seed, deadline, model_digest, search, warm_start, steps_left, approach } =
-            request;
+        let PlanRequest {
+            model,
+            goal,
+            observation,
+            seed,
+            deadline,
+            model_digest,
+            search,
+            warm_start,
+            steps_left,
+            approach,
+        } = request;
         if let Observation::Image(image) = &observation {
             check_size("observation", image)?;
         }

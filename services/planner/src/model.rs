@@ -161,7 +161,8 @@ impl Model {
             let plan =
                 self.method.plan(&[query], &mut method::Search { solver, iterations: iterations_left }).remove(0);
             self.costs.record_rollouts(solver, method::rollouts(solver, iterations), started.elapsed());
-            check_plan(&plan, query.x, query.x_g).map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
+            check_plan(&plan, query.x, query.x_g)
+                .map_err(|e| Error::invalid("checkpoint", "one whose plans are finite", e))?;
         }
         Ok(())
     }

@@ -108,14 +108,15 @@ impl Latents {
             Some(approach) => approach.next(&x, &goal.x_g, goal.is_familiar),
             None => Approach::first(&x),
         });
-        let towards = approach.map_or_else(|| goal.x_g.clone(), |approach| approach.towards(&goal.x_g, goal.is_familiar));
+        let towards =
+            approach.map_or_else(|| goal.x_g.clone(), |approach| approach.towards(&goal.x_g, goal.is_familiar));
         Self { x, goal, approach, towards }
     }
 
     /// Whether the policy's plan is kept: for a familiar goal, unless the approach has left it.
     fn keeps_policy(&self) -> bool {
         let GoalEmbedding { is_familiar, .. } = self.goal;
-        is_familiar && self.approach.is_none_or(|approach| approach.keeps_policy(is_familiar))
+        self.approach.map_or(is_familiar, |approach| approach.keeps_policy(is_familiar))
     }
 }
 

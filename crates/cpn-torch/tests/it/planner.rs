@@ -279,6 +279,7 @@ fn a_familiar_goal_keeps_the_initial_plan_of_its_row() {
         for engine in engines() {
             let mut planner = planner(&*engine, &model);
             assert_eq!([&x_g[0], &x_g[1]].map(|x_g| planner.is_familiar(x_g)), [true, false], "{engine:?}");
+            assert_eq!(planner.moves_positions(), position_dynamics, "{engine:?}");
             let updated = queries(&x, &x_g, &[]);
             let kept = [Query { keep_initial: true, ..updated[0] }, updated[1]];
             let plans = planner.plan(&kept, &mut fixed(Solver::Gradient, 2));

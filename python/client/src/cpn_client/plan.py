@@ -43,7 +43,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Approach:
-    """Progress of an episode's hand towards its targets, of a model with position dynamics."""
+    """Progress of an episode's hand through its targets, of a model with position dynamics."""
 
     tried: int
     """Number of targets that were reached or given up."""
@@ -76,7 +76,7 @@ class Plan:
     """[A], action to apply now: the first, clipped to [-1, 1]."""
     inner_losses: tuple[float, ...]
     """[iterations_run + 1], Huber distance to the goal's embedding, with position dynamics to its first three elements,
-    before and after each iteration; empty for methods that do not plan."""
+    of the approach's target if the request has one, before and after each iteration; empty for methods that do not plan."""
     latent_distance: float | None
     """Euclidean distance between the observation's and the goal's embedding; None for the random method."""
     times: StageTimes

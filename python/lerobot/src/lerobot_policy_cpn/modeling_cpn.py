@@ -37,6 +37,7 @@ class CpnPolicy(PreTrainedPolicy):
         config.validate_features()
         self._goals = {task: Image.of(file, field="goals") for task, file in config.goals.items()}
         self._goal = Image.of(config.goal, field="goal") if config.goal else None
+        self._approaches = config.approaches
         self._search = None if config.updates is None else Search(iterations=config.updates)
         self._image_key = config.camera_key
         self._goal_key = config.goal_key if config.observes_goal else None
@@ -91,7 +92,9 @@ class CpnPolicy(PreTrainedPolicy):
         goal = observed if file is None else file
         if goal is None:
             raise ValueError(f"goals: expected an image file for {task!r}, got those for {', '.join(self._goals)}")
-        return self._planner.episode(goal, model=self._model, seed=self._seed, search=self._search)
+        return self._planner.episode(
+            goal, model=self._model, seed=self._seed, approaches=self._approaches, search=self._search
+        )
 
 
 def _pixels(images: Tensor) -> Pixels:

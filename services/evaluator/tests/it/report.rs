@@ -176,19 +176,26 @@ fn recording(seed: u64, steps: u32) -> Recording {
     Recording::new(trial, (0..=steps).map(frame).collect(), Vec::new()).unwrap()
 }
 
-/// Records from before plans could be set and progress was measured are of the default, and stay as they were.
+/// Records without progress are read; those without settings are from before there were approaches.
 #[test]
 fn records_without_settings_and_progress_are_read() {
     let (root, folder) = folder();
-    for path in ["run.json", "trials/door-lock/cpn/1000010.json"].map(|name| folder.path(name)) {
-        assert!(!std::fs::read_to_string(path).unwrap().contains("planning"));
-    }
     let path = folder.path("trials/door-lock/cpn/1000010.json");
     let mut record: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
     record["episode"].as_object_mut().unwrap().remove("progress").unwrap();
     std::fs::write(&path, record.to_string()).unwrap();
     let row = &evaluator::report(root.path()).unwrap().rows[0];
     assert_eq!((row.trials, row.mean_best_progress, row.mean_final_progress), (4, Some(0.5), Some(0.25)));
+
+    for name in ["run.json", "trials/door-lock/cpn/1000010.json"] {
+        let mut record: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path(name)).unwrap()).unwrap();
+        record.as_object_mut().unwrap().remove("planning").unwrap();
+        std::fs::write(folder.path(name), record.to_string()).unwrap();
+    }
+    let summary = evaluator::report(root.path()).unwrap();
+    assert_eq!((summary.run.planning.no_approaches, summary.rows[0].trials), (true, 1));
+    folder.write_run(&run()).unwrap();
+    assert_eq!(evaluator::report(root.path()).unwrap().rows[0].trials, 3);
 
     // Trials with other settings of plans belong to another run.
     let planning = Planning { updates: Some(20), ..Planning::default() };

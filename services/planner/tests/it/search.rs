@@ -54,8 +54,8 @@ async fn every_solver_is_deterministic_and_uses_the_warm_start() {
 }
 
 /// Checkpoint whose one familiar goal is the image of seed 0.
-fn familiar_checkpoint() -> Vec<u8> {
-    let mut model = Model::new(ModelConfig { familiar_goals: 1, ..small_config(MethodKind::Cpn) }, 1);
+fn familiar_checkpoint(config: ModelConfig) -> Vec<u8> {
+    let mut model = Model::new(config, 1);
     let embeddings = Planner::new(&model, Precision::Float32, 1).encode(&[Observed::Image(&image(0).data)]);
     model.set_familiar_goals(&embeddings);
     cpn::checkpoint::to_bytes(&model, &provenance(&["reach"], 1)).unwrap()
@@ -63,7 +63,8 @@ fn familiar_checkpoint() -> Vec<u8> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_familiar_goal_keeps_the_policys_plan_unless_the_request_says_otherwise() {
-    let fixture = Fixture::start(&[("cpn", familiar_checkpoint())], |_| ()).await;
+    let config = ModelConfig { familiar_goals: 1, ..small_config(MethodKind::Cpn) };
+    let fixture = Fixture::start(&[("cpn", familiar_checkpoint(config))], |_| ()).await;
     for client in fixture.clients() {
         let plan = async |request: proto::PlanRequest| timeless(client.plan(request).await.unwrap());
         let request = plan_request("cpn", 3);
@@ -106,6 +107,10 @@ async fn an_approach_moves_the_target_when_the_hand_stalls() {
             assert_eq!(last.latent_distance, first.latent_distance);
             assert_eq!(last.actions == first.actions, tried == 0, "over {}", client.transport());
         }
+        let at = |tried| Some(proto::Approach { tried, ..last.approach.unwrap().into() });
+        let plan = async |approach| client.plan(proto::PlanRequest { approach, ..request.clone() }).await.unwrap();
+        assert_eq!(plan(at(1)).await.actions, last.actions);
+        assert_eq!(plan(at(2)).await.actions, first.actions, "the goal's position again");
 
         let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..request };
         assert_eq!(timeless(client.plan(named).await.unwrap()), PlanResponse { approach: None, ..first });
@@ -113,6 +118,23 @@ async fn an_approach_moves_the_target_when_the_hand_stalls() {
         let other = client.plan(proto::PlanRequest { approach, ..plan_request("cpn", 3) }).await;
         is(Code::InvalidArgument, "approach", other);
     }
+}
+
+/// Of a familiar goal the approach begins with the policy, and leaves it after 24 plans without motion.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_approach_leaves_the_policy_when_the_hand_stalls() {
+    let config = ModelConfig { position_dynamics: true, familiar_goals: 1, ..small_config(MethodKind::Cpn) };
+    let fixture = Fixture::start(&[("cpn", familiar_checkpoint(config))], |_| ()).await;
+    let [client, ..] = fixture.clients();
+    let mut approach = None;
+    for _ in 0..24 {
+        let plan = client.plan(proto::PlanRequest { approach, ..plan_request("cpn", 3) }).await.unwrap();
+        assert_eq!(plan.iterations, 0);
+        approach = plan.approach.map(Into::into);
+    }
+    let later = client.plan(proto::PlanRequest { approach, ..plan_request("cpn", 3) }).await.unwrap();
+    let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..plan_request("cpn", 3) };
+    assert_eq!((later.iterations, later.actions), (1, client.plan(named).await.unwrap().actions));
 }
 
 #[tokio::test(flavor = "multi_thread")]
