@@ -44,7 +44,7 @@ struct Leader {
 /// Job of the model thread.
 #[derive(Debug)]
 pub(crate) enum Job {
-    Plan(Waiting),
+    Plan(Box<Waiting>),
     Serve { model: Model, reply: oneshot::Sender<Result<(), Error>> },
     Unload { model: String, reply: oneshot::Sender<Result<(), Error>> },
     Stop,
@@ -123,9 +123,9 @@ impl ModelThread {
         };
         self.load.begin(estimate);
         let queued = debug_span!(parent: &task.span, "queue");
-        let job = Job::Plan(Waiting { task, enqueued, queued, place, reply, estimate });
-        if let Err(SendError(Job::Plan(Waiting { reply, .. }))) = self.jobs.send(job) {
-            return reply.send(Err(shutting_down()));
+        let job = Job::Plan(Box::new(Waiting { task, enqueued, queued, place, reply, estimate }));
+        if let Err(SendError(Job::Plan(waiting))) = self.jobs.send(job) {
+            return waiting.reply.send(Err(shutting_down()));
         }
         if self.load.replying().is_some() {
             self.leadership.watch();

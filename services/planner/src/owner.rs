@@ -90,7 +90,7 @@ impl Owner {
         let (started, idle) = (Instant::now(), job.is_none());
         match job {
             Some(Job::Plan(first)) => {
-                let batch = self.gather(first, jobs);
+                let batch = self.gather(*first, jobs);
                 self.answer(batch);
             }
             Some(Job::Serve { model, reply }) => drop(reply.send(self.serve(model))),
@@ -160,7 +160,7 @@ impl Owner {
                     let short = waiting.estimate.is_long || waiting.task.search.is_none() || together <= MAX_BATCH_TIME;
                     if in_time && short {
                         (due, time) = (earliest, together);
-                        batch.push(waiting);
+                        batch.push(*waiting);
                     } else {
                         rest.push_back(Job::Plan(waiting));
                     }
