@@ -108,7 +108,7 @@ REPORTED_ARMS = {
     "familiar-goals": (DEFAULT, APPROACHES),
 }
 """Arms that are run on the reported tasks, with their numbers of updates."""
-BEST = ("familiar-goals", APPROACHES)
+BEST = ("accurate-position-dynamics", "5")
 """Arm and number of updates that the others are compared with."""
 SEEDS = (0, 1)
 TRIALS = 20

@@ -76,7 +76,9 @@ class Plan:
     """[A], action to apply now: the first, clipped to [-1, 1]."""
     inner_losses: tuple[float, ...]
     """[iterations_run + 1], Huber distance to the goal's embedding, with position dynamics to its first three elements,
-    of the approach's target if the request has one, before and after each iteration; empty for methods that do not plan."""
+    of the approach's target if the request has one, before and after each iteration; empty for methods that do not
+    plan.
+    """
     latent_distance: float | None
     """Euclidean distance between the observation's and the goal's embedding; None for the random method."""
     times: StageTimes
@@ -90,8 +92,8 @@ class Plan:
     warm_start: tuple[Action, ...]
     """[horizon, A], plan to start the next step's search from; empty for methods that do not plan."""
     approach: Approach | None
-    """Approach for the next step's request; None for models without position dynamics, and for a request with a search or
-    a warm start."""
+    """Approach for the next step's request; None for models without position dynamics, and for a request with a search
+    or a warm start."""
     request_bytes: int
     """Size of the request, in bytes."""
 

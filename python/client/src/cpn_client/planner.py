@@ -63,8 +63,8 @@ class Planner:
             deadline_ms: Longest wait for the plan, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             warm_start: [horizon, A], initial plan of the search: `Plan.warm_start` of the step before.
-            approach: `Plan.approach` of the step before, for a new target where the hand stalls; None at the first step, or
-                to plan straight towards the goal. Not together with `search` or `warm_start`.
+            approach: `Plan.approach` of the step before, for a new target where the hand stalls; None at the first
+                step, or to plan straight towards the goal. Not together with `search` or `warm_start`.
             steps_left: Number of steps that remain for the task, for models of the method te-bc-horizon.
             model_digest: SHA-256, in hex, of the checkpoint that must answer; any if empty.
 
@@ -126,9 +126,9 @@ class Planner:
             seed: Seed of the first plan; each step adds one.
             warm_start: Whether each search starts from the plan before, moved on by one step, in place of the policy's
                 plan: for searches of many iterations.
-            approaches: Whether, with a model of position dynamics, an episode without a search and warm starts tries the
-                sides of the goal in turn where the hand stalls. False for an arm that must rest at the goal: the planner
-                is not told of success.
+            approaches: Whether, with a model of position dynamics, an episode without a search and warm starts tries
+                the sides of the goal in turn where the hand stalls. False for an arm that must rest at the goal: the
+                planner is not told of success.
             deadline_ms: Longest wait for an action, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             with_fallback: Action, [A], in place of one that is late or whose planner is away or too busy; None for the

@@ -25,8 +25,8 @@ class CpnConfig(PreTrainedConfig):
     updates: int | None = None
     """Number of updates of a plan; the model's own if None."""
     approaches: bool = True
-    """Whether a model of position dynamics tries the sides of the goal in turn where the hand stalls; false for an arm that
-    must rest at the goal, since the planner is not told of success."""
+    """Whether a model of position dynamics tries the sides of the goal in turn where the hand stalls; false for an arm
+    that must rest at the goal, since the planner is not told of success."""
     seed: int = 0
     """Seed of the first plan of an episode; each step adds one."""
     image_key: str | None = None
