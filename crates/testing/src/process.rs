@@ -3,15 +3,30 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
 
 /// Timeout that no passing test reaches.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Address on loopback that nothing listens on.
+/// Ports of [`free_address`], below those of outgoing connections (from 32,768 on Linux), which could take one before a program does.
+const PORTS: std::ops::Range<u32> = 10_000..32_768;
+
+/// Address on loopback that nothing listens on; each call of a process returns another.
+///
+/// # Panics
+///
+/// If no port is free.
 pub fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("an address")
+    static CALLS: AtomicU32 = AtomicU32::new(0);
+    let candidate = || {
+        // Processes at the same time begin apart.
+        let number = std::process::id().wrapping_mul(97).wrapping_add(CALLS.fetch_add(1, Ordering::Relaxed));
+        let port = (PORTS.start + number % PORTS.len() as u32) as u16;
+        TcpListener::bind(("127.0.0.1", port)).and_then(|listener| listener.local_addr()).ok()
+    };
+    PORTS.into_iter().find_map(|_| candidate()).expect("a free port")
 }
 
 /// Process of a service, killed when dropped.

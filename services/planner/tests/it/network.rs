@@ -4,8 +4,9 @@ use crate::common::{self, soon};
 use planner::Config;
 use service_kit::SessionConfig;
 use service_kit::session::Mode;
-use std::net::{SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::time::Duration;
+use testing::process::free_address;
 use tonic::transport::Channel;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -15,10 +16,6 @@ use wire::{Code, key, query};
 use zenoh::Session;
 
 const TIMEOUT: Duration = Duration::from_secs(2);
-
-fn free_address() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
-}
 
 async fn router(endpoint: &str) -> Session {
     let config = SessionConfig { mode: Some(Mode::Router), listen: vec![endpoint.into()], ..SessionConfig::default() };
