@@ -4,6 +4,7 @@
 //! field, so that services see valid values only. A property test round-trips every message.
 
 pub mod access;
+mod approach;
 pub mod checkpoint;
 pub mod demonstration;
 mod error;

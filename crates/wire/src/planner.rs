@@ -1,5 +1,6 @@
 //! Requests and responses of the planner service.
 
+pub use crate::approach::Approach;
 use crate::message::{action, digest, name, required};
 pub use crate::search::{MAX_ITERATIONS, Search, Solver};
 use crate::{Error, Image, Message, Observation, Position, proto};
@@ -9,8 +10,6 @@ use std::time::Duration;
 const MAX_HORIZON: usize = 64;
 /// Largest absolute value in a warm start; executed actions are clipped to [-1, 1].
 const MAX_WARM_START: f32 = 1000.0;
-/// Largest absolute value in an approach's position, in standard deviations.
-const MAX_POSITION: f32 = 1000.0;
 /// Largest number of steps left.
 pub const MAX_STEPS_LEFT: u32 = 10_000;
 
@@ -48,17 +47,6 @@ pub struct PlanRequest {
     pub steps_left: Option<u32>,
     /// Approach of the episode, from the response before; not together with a search or a warm start.
     pub approach: Option<Approach>,
-}
-
-/// Progress of an episode's hand through its targets.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Approach {
-    /// Number of targets that were reached or given up.
-    pub tried: u32,
-    /// Position of the hand when it last moved, standardised.
-    pub position: [f32; 3],
-    /// Number of plans since then.
-    pub plans: u32,
 }
 
 /// Plan.
@@ -296,29 +284,6 @@ impl From<PlanRequest> for proto::PlanRequest {
             steps_left: request.steps_left,
             approach: request.approach.map(Into::into),
         }
-    }
-}
-
-impl TryFrom<proto::Approach> for Approach {
-    type Error = Error;
-
-    fn try_from(approach: proto::Approach) -> Result<Self, Error> {
-        let proto::Approach { tried, position, plans } = approach;
-        let Ok(position) = <[f32; 3]>::try_from(position.as_slice()) else {
-            return Err(Error::invalid("position", "3 numbers", position.len()));
-        };
-        match position.iter().find(|value| value.is_nan() || value.abs() > MAX_POSITION) {
-            Some(value) => {
-                Err(Error::invalid("position", format!("numbers from -{MAX_POSITION} to {MAX_POSITION}"), value))
-            }
-            None => Ok(Self { tried, position, plans }),
-        }
-    }
-}
-
-impl From<Approach> for proto::Approach {
-    fn from(Approach { tried, position, plans }: Approach) -> Self {
-        Self { tried, position: position.to_vec(), plans }
     }
 }
 
