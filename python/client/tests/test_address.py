@@ -97,6 +97,49 @@ def test_command_line_is_let_in(secure: Secure, tmp_path: Path) -> None:
         assert "te-bc" in shell.output("models", *let_in)
 
 
+def test_environment_lets_in(secure: Secure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    certificate = {"CPN_TLS_CERTIFICATE": secure.tls.certificate, "CPN_TLS_PRIVATE_KEY": secure.tls.private_key}
+    for endpoint, others in (
+        (secure.process.zenoh, certificate | {"CPN_TOKEN_FILE": ""}),
+        (secure.process.grpc, {"CPN_TOKEN_FILE": tmp_path / "token"}),
+    ):
+        with monkeypatch.context() as environment:
+            for variable, value in ({"CPN_CONNECT": endpoint, "CPN_TLS_CA": secure.tls.ca} | others).items():
+                environment.setenv(variable, str(value))
+            with cpn_client.connect_from_environment() as planner:
+                assert "te-bc" in [model.name for model in planner.models()]
+            environment.setenv("CPN_CONNECT", "nowhere")
+            with cpn_client.connect_from_environment(endpoint) as planner:
+                assert planner.models()
+
+
+def test_environment_names_planner_and_namespace(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running("--name", "p7", "--namespace", "lab") as process:
+        monkeypatch.setenv("CPN_CONNECT", process.zenoh)
+        monkeypatch.setenv("CPN_PLANNER_NAME", "p7")
+        monkeypatch.setenv("CPN_NAMESPACE", "lab")
+        with cpn_client.connect_from_environment() as planner:
+            assert planner.models()
+
+
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [
+        ("CPN_TLS_CERTIFICATE", "CPN_TLS_CA: expected a file, as none.pem is given, got none"),
+        (
+            "CPN_TOKEN_FILE",
+            "CPN_TOKEN_FILE: expected a file with a token, got .* No such file or directory: ",
+        ),
+        ("CPN_CONNECT", "address: expected a zenoh endpoint, .*got 'none.pem'"),
+    ],
+)
+def test_faulty_variables_are_named(monkeypatch: pytest.MonkeyPatch, variable: str, message: str) -> None:
+    monkeypatch.setenv(variable, "none.pem")
+    with pytest.raises(ValueError, match=message):
+        cpn_client.connect_from_environment()
+
+
 def test_faulty_files_are_named(secure: Secure, tmp_path: Path) -> None:
     faulty = tmp_path / "faulty.pem"
     faulty.write_text("no certificate")

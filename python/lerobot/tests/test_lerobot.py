@@ -75,6 +75,13 @@ def test_updates_and_model_are_those_of_the_configuration(address: str) -> None:
     assert torch.equal(action, planned(address, FRAME, model="te-bc")[:, 0])
 
 
+def test_approaches_lead_beside_the_goal_where_the_hand_stalls(address: str) -> None:
+    for approaches, number in ((True, 2), (False, 1)):
+        policy = make(address, model="cpn-position", approaches=approaches)
+        actions = torch.cat([policy.select_action(batch(FRAME)) for _ in range(10)])
+        assert len(actions.unique(dim=0)) == number
+
+
 def test_images_of_another_size_are_scaled_as_by_the_client(address: str, tmp_path: Path) -> None:
     large = tmp_path / "large.png"
     PIL.Image.open(FRAME).convert("RGB").resize((480, 480)).save(large)

@@ -56,6 +56,14 @@ def test_actions_are_those_of_the_client(planner: cpn_client.Planner) -> None:
         envs.infos = envs.envs.step(actions)[-1]
 
 
+def test_approaches_lead_beside_the_goal_where_the_hand_stalls(planner: cpn_client.Planner) -> None:
+    for approaches, number in ((True, 2), (False, 1)):
+        policy = PlannerPolicy(planner, model="cpn-position", approaches=approaches)
+        infos = world("drawer-close", policy).infos
+        actions = [policy.get_action(infos | {"step_idx": np.full((1, 1), step)}) for step in range(10)]
+        assert len({action.tobytes() for action in actions}) == number
+
+
 def test_each_episode_begins_anew_and_a_finished_one_is_not_planned(planner: cpn_client.Planner) -> None:
     policy = PlannerPolicy(planner, model="random")
     envs = world("reach", policy, num_envs=2, max_episode_steps=1)

@@ -76,6 +76,13 @@ def test_seed_counts_the_steps_of_each_episode(address: str, planned: Callable[.
     assert np.array_equal(got, expected)
 
 
+def test_approaches_lead_beside_the_goal_where_the_hand_stalls(address: str) -> None:
+    for approaches, number in ((True, 2), (False, 1)):
+        server = PlannerModelServer(address, model="cpn-position", goal=str(GOAL), approaches=approaches)
+        got = actions(server, [observation()] * 10)
+        assert len({action.tobytes() for action in got}) == number
+
+
 def test_each_task_has_its_goal_and_the_camera_is_chosen(
     address: str, planned: Callable[..., NDArray[np.float32]]
 ) -> None:

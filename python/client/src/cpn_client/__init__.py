@@ -2,6 +2,7 @@
 
 from cpn_client.connection import connect, connect_async
 from cpn_client.demonstration import write_episode
+from cpn_client.environment import connect_from_environment
 from cpn_client.episode import AsyncEpisode, Episode
 from cpn_client.errors import (
     LateError,
@@ -38,6 +39,7 @@ __all__ = [
     "UnreachableError",
     "connect",
     "connect_async",
+    "connect_from_environment",
     "recorded_goal",
     "recorded_observation",
     "write_episode",

@@ -14,8 +14,11 @@ UNTRAINABLE = "policy cpn: its models are trained by cpn-trainer and served by c
 class CpnConfig(PreTrainedConfig):
     """Configuration of a policy that asks a planner for each action."""
 
-    address: str = "tcp/127.0.0.1:7447"
-    """Address of the planner: a zenoh endpoint, `grpc://HOST:PORT` or `grpcs://HOST:PORT`."""
+    address: str = ""
+    """Address of the planner: a zenoh endpoint, `grpc://HOST:PORT` or `grpcs://HOST:PORT`; by default `CPN_CONNECT`.
+
+    Certificates, a token and the rest of the connection are never part of a configuration, which is saved with datasets
+    and results: they come from environment variables, see `cpn_client.connect_from_environment`."""
     model: str = "cpn"
     """Name of the planner's model."""
     goal: str = ""

@@ -29,7 +29,8 @@ class CpnPolicy(PreTrainedPolicy):
         """Reads the goal images and connects to the planner.
 
         Raises:
-            ValueError: If the configuration has no goal image or no camera image, or the address is malformed.
+            ValueError: If the configuration has no goal image or no camera image, or the address or a setting of the
+                environment is malformed.
             OSError: If a goal image cannot be read.
             cpn_client.PlannerError: If the address leads to no planner.
         """
@@ -42,7 +43,7 @@ class CpnPolicy(PreTrainedPolicy):
         self._image_key = config.camera_key
         self._goal_key = config.goal_key if config.observes_goal else None
         self._model, self._seed = config.model, config.seed
-        self._planner = cpn_client.connect(config.address)
+        self._planner = cpn_client.connect_from_environment(config.address)
         self.reset()
 
     def reset(self) -> None:

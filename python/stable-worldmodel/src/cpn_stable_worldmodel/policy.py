@@ -15,19 +15,34 @@ class PlannerPolicy(BasePolicy):
     Each episode of an environment is one of the planner, whose plans come from one checkpoint.
     """
 
-    def __init__(self, planner: Planner, *, model: str, search: Search | None = None, first_seed: int = 0) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        *,
+        model: str,
+        search: Search | None = None,
+        approaches: bool = True,
+        first_seed: int = 0,
+    ) -> None:
         """Makes the policy.
 
         Args:
             planner: Connected planner.
             model: Name of the model.
             search: Search for the actions; the model's own if None.
+            approaches: Whether a model of position dynamics tries the sides of the goal in turn where the hand stalls;
+                false for an arm that must rest at the goal, since the planner is not told of success.
             first_seed: Seed of the first plan of an episode; each step adds one.
         """
         super().__init__()
         self.type = "planner"
         self._planner = planner
-        self._settings: dict[str, Any] = {"model": model, "search": search, "seed": first_seed}
+        self._settings: dict[str, Any] = {
+            "model": model,
+            "search": search,
+            "approaches": approaches,
+            "seed": first_seed,
+        }
         self._episodes: dict[int, Episode] = {}
 
     def get_action(self, obs: dict[str, Any], **_: Any) -> NDArray[np.float32]:  # noqa: ANN401

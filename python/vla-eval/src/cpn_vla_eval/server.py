@@ -23,27 +23,31 @@ class PlannerModelServer(PredictModelServer):
 
     def __init__(
         self,
-        address: str = "tcp/127.0.0.1:7447",
+        address: str = "",
         model: str = "cpn",
         goal: str = "",
         goals: dict[str, str] | None = None,
         camera: str = "",
         updates: int | None = None,
+        approaches: bool = True,
         seed: int = 0,
     ) -> None:
         """Reads the goal images and connects to the planner.
 
         Args:
-            address: Zenoh endpoint of the planner or of a router, or `grpc://HOST:PORT` or `grpcs://HOST:PORT`.
+            address: Zenoh endpoint of the planner or of a router, or `grpc://HOST:PORT` or `grpcs://HOST:PORT`; by
+                default and beyond that, `cpn_client.connect_from_environment`.
             model: Name of the planner's model.
             goal: Image file of the finished task, for tasks without one in `goals`.
             goals: Image files of the finished task, by the task's description.
             camera: Name of the camera; may be left out where observations have one image.
             updates: Number of updates of a plan; the model's own if None.
+            approaches: Whether a model of position dynamics tries the sides of the goal in turn where the hand stalls;
+                false for an arm that must rest at the goal, since the planner is not told of success.
             seed: Seed of the first plan of an episode; each step adds one.
 
         Raises:
-            ValueError: If there is no goal image, or the address is malformed.
+            ValueError: If there is no goal image, or the address or a setting of the environment is malformed.
             OSError: If a goal image cannot be read.
             cpn_client.PlannerError: If the address leads to no planner.
         """
@@ -54,8 +58,8 @@ class PlannerModelServer(PredictModelServer):
             raise ValueError("goal: expected an image file of the finished task, or goals, got neither")
         self._camera = camera
         search = None if updates is None else Search(iterations=updates)
-        self._settings: dict[str, Any] = {"model": model, "search": search, "seed": seed}
-        self._planner = cpn_client.connect(address)
+        self._settings: dict[str, Any] = {"model": model, "search": search, "approaches": approaches, "seed": seed}
+        self._planner = cpn_client.connect_from_environment(address)
         self._episodes: dict[str, Episode] = {}
 
     def predict(self, obs: Observation, ctx: SessionContext) -> Action:

@@ -1,28 +1,26 @@
 """Options of the connection to a planner."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import cpn_client
 from cpn_client.cli.arguments import Address, File, Text
-from cpn_client.errors import invalid
+from cpn_client.environment import ADDRESS, read_token, tls_of, variable
 
 
-def _environment(variable: str, otherwise: str = "") -> Callable[[], str]:
-    """Default factory that reads an environment variable; an empty one counts as unset."""
-    return lambda: os.environ.get(variable) or otherwise
+def _environment(name: str, otherwise: str = "") -> Callable[[], str]:
+    """Default factory that reads an environment variable."""
+    return lambda: variable(name, otherwise)
 
 
 @dataclass(frozen=True)
 class Connection:
     """Connection to the planner. Environment variables stand in for options that are not given."""
 
-    planner: Address = field(default_factory=_environment("CPN_CONNECT", "tcp/127.0.0.1:7447"))
+    planner: Address = field(default_factory=_environment("CPN_CONNECT", ADDRESS))
     """Address: tcp/HOST:PORT or tls/HOST:PORT for zenoh, grpc://HOST:PORT or grpcs://HOST:PORT. CPN_CONNECT."""
-    planner_name: Text = "planner"
-    """Name of the planner in its zenoh keys."""
+    planner_name: Text = field(default_factory=_environment("CPN_PLANNER_NAME", "planner"))
+    """Name of the planner in its zenoh keys. CPN_PLANNER_NAME."""
     namespace: Text = field(default_factory=_environment("CPN_NAMESPACE"))
     """Prefix of every zenoh key, as the planner's own. CPN_NAMESPACE."""
     tls_ca: File = field(default_factory=_environment("CPN_TLS_CA"))
@@ -41,18 +39,9 @@ class Connection:
             ValueError: If an option does not go with another, or a file cannot be read.
         """
         return cpn_client.connect(
-            self.planner, name=self.planner_name, namespace=self.namespace, tls=self._tls(), token=self._token()
+            self.planner,
+            name=self.planner_name,
+            namespace=self.namespace,
+            tls=tls_of(self.tls_ca, self.tls_certificate, self.tls_private_key, field="--tls-ca"),
+            token=read_token(self.token_file, field="--token-file"),
         )
-
-    def _tls(self) -> cpn_client.Tls | None:
-        if self.tls_ca:
-            return cpn_client.Tls(self.tls_ca, self.tls_certificate or None, self.tls_private_key or None)
-        if self.tls_certificate or self.tls_private_key:
-            raise invalid("--tls-ca", "a file, as --tls-certificate or --tls-private-key is given", "none")
-        return None
-
-    def _token(self) -> str:
-        try:
-            return Path(self.token_file).read_text().strip() if self.token_file else ""
-        except (OSError, UnicodeDecodeError) as error:
-            raise invalid("--token-file", "a file with a token", error) from None
