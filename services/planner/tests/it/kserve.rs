@@ -49,7 +49,7 @@ fn set(request: &mut ModelInferRequest, name: &str, choice: ParameterChoice) {
 }
 
 /// Request equivalent to [`plan_request`].
-fn request(model: &str, seed: i64) -> ModelInferRequest {
+pub(crate) fn request(model: &str, seed: i64) -> ModelInferRequest {
     ModelInferRequest {
         model_name: model.into(),
         parameters: [("seed".into(), parameter(ParameterChoice::Int64Param(seed)))].into(),

@@ -1,6 +1,7 @@
 //! Spans of a request, as exported to a collector.
 
 use crate::common::{NAME, PATIENCE, Program, plan_request};
+use crate::kserve;
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{TraceService, TraceServiceServer};
 use opentelemetry_proto::tonic::collector::trace::v1::{ExportTraceServiceRequest, ExportTraceServiceResponse};
 use opentelemetry_proto::tonic::trace::v1::Span;
@@ -9,6 +10,7 @@ use prost::Message as _;
 use tokio::sync::mpsc;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
+use wire::inference::grpc_inference_service_client::GrpcInferenceServiceClient;
 use wire::key;
 use wire::proto::planner_service_client::PlannerServiceClient;
 
@@ -52,6 +54,11 @@ async fn spans_follow_a_request_from_its_client() {
     let mut request = Request::new(plan_request(RANDOM, 1));
     request.metadata_mut().insert("traceparent", traceparent.parse().unwrap());
     PlannerServiceClient::new(program.channel.clone()).plan(request).await.unwrap();
+    assert_traced(&mut spans).await;
+
+    let mut request = Request::new(kserve::request(RANDOM, 1));
+    request.metadata_mut().insert("traceparent", traceparent.parse().unwrap());
+    GrpcInferenceServiceClient::new(program.channel.clone()).model_infer(request).await.unwrap();
     assert_traced(&mut spans).await;
 
     // A malformed traceparent is ignored.
