@@ -1,5 +1,6 @@
 """Plan request with openpi's own client, towards a goal image.
 
+make test-openpi makes the environment; the planner is started with --openpi-listen 127.0.0.1:8000.
 tests/openpi/.venv/bin/python examples/plan_openpi.py examples/goal.png examples/frame.png
 """
 

@@ -1,5 +1,6 @@
 """Plan request with Triton's own client, towards a goal image.
 
+make test-triton makes the environment.
 tests/triton/.venv/bin/python examples/plan_triton.py examples/goal.png examples/frame.png
 """
 
