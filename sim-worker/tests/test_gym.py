@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv
 from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.gym import SceneEnv
 from cpn_sim_worker.simulator import Simulator
-from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, JENGA_TASKS, TASKS, SeedError, UnknownTaskError
+from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, JENGA_TASKS, METAWORLD_TASKS, SeedError, UnknownTaskError
 from tests.support import UNSOLVED
 
 SEED = FIRST_EVALUATION_SEED
@@ -26,7 +26,7 @@ def make(task: str, **options: Any) -> gymnasium.Env:  # noqa: ANN401
 
 def test_every_task_has_an_id() -> None:
     ids = {name for name in gymnasium.registry if name.startswith("cpn/")}
-    assert ids == {f"cpn/{task}-v0" for task in TASKS + JENGA_TASKS}
+    assert ids == {f"cpn/{task}-v0" for task in METAWORLD_TASKS + JENGA_TASKS}
 
 
 @pytest.mark.parametrize(("task", "goal_image"), [("reach", True), ("jenga-poke", False)])

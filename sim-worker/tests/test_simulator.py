@@ -10,7 +10,7 @@ from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.scene import CameraPose, camera_pose
 from cpn_sim_worker.simulator import Simulator
 from cpn_sim_worker.spaces import IMAGE_SIZE
-from cpn_sim_worker.tasks import TASKS, UnknownTaskError
+from cpn_sim_worker.tasks import METAWORLD_TASKS, UnknownTaskError
 
 # Prints one digest per frame of a short walk through the tasks named on its command line.
 WALK = """
@@ -40,7 +40,7 @@ def physics(simulator: Simulator) -> NDArray[np.float64]:
     return np.concatenate([data.qpos, data.qvel, data.mocap_pos.ravel()])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", METAWORLD_TASKS)
 def test_variation_depends_on_task_and_seed_alone(simulator: Simulator, task: str) -> None:
     first_state = simulator.reset(task, 3)
     first = physics(simulator)
@@ -70,9 +70,9 @@ def test_frame_changes_when_the_arm_moves(simulator: Simulator) -> None:
 
 def test_two_processes_draw_every_task_alike() -> None:
     """Frames are equal in concurrent processes, whatever was drawn before: one goes through the tasks backwards."""
-    forth, back = start_walk(*TASKS), start_walk(*reversed(TASKS))
+    forth, back = start_walk(*METAWORLD_TASKS), start_walk(*reversed(METAWORLD_TASKS))
     first, second = (process.communicate()[0].split() for process in (forth, back))
-    frames = len(first) // len(TASKS)
+    frames = len(first) // len(METAWORLD_TASKS)
     assert frames == 3
     backwards = [second[i : i + frames] for i in range(0, len(second), frames)]
     assert first == [digest for task in reversed(backwards) for digest in task]

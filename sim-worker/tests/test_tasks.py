@@ -4,7 +4,7 @@
 import mujoco
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
-from cpn_sim_worker.tasks import TASKS
+from cpn_sim_worker.tasks import METAWORLD_TASKS, TASKS
 
 ALL = {name.removesuffix("-v3-goal-observable"): env for name, env in ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE.items()}
 NAMED_IN_THE_PAPER = {"coffee-button", "dial-turn", "door-lock", "drawer-close"}
@@ -26,3 +26,7 @@ def test_list_follows_the_rule() -> None:
     mechanisms = {task for task in ALL if not is_variant(task) and moves_a_mechanism(task)}
     assert set(TASKS) == mechanisms | NAMED_IN_THE_PAPER | CHOSEN_BY_HAND
     assert len(TASKS) == 24
+
+
+def test_every_task_of_metaworld_is_served() -> None:
+    assert sorted(METAWORLD_TASKS) == sorted(ALL)

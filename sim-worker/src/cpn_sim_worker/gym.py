@@ -12,7 +12,7 @@ from cpn_sim_worker.expert import ExpertFailedError, solve
 from cpn_sim_worker.render import process_renderer
 from cpn_sim_worker.simulator import Simulator, scene_type
 from cpn_sim_worker.spaces import IMAGE_SIZE
-from cpn_sim_worker.tasks import EPISODE_STEPS, FIRST_EVALUATION_SEED, JENGA_TASKS, TASKS
+from cpn_sim_worker.tasks import EPISODE_STEPS, FIRST_EVALUATION_SEED, JENGA_TASKS, METAWORLD_TASKS
 
 
 class SceneEnv(gymnasium.Env[NDArray[np.uint8], NDArray[np.float32]]):
@@ -112,7 +112,7 @@ def _info(state: NDArray[np.float64], success: bool) -> dict[str, Any]:
     return {"state": state.copy(), "success": success}
 
 
-for _task in TASKS + JENGA_TASKS:
+for _task in METAWORLD_TASKS + JENGA_TASKS:
     gymnasium.register(
         f"cpn/{_task}-v0",
         entry_point=f"{__name__}:{SceneEnv.__name__}",

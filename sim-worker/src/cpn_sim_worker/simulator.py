@@ -7,7 +7,7 @@ from cpn_sim_worker.jenga import JengaScene
 from cpn_sim_worker.metaworld_scene import MetaWorldScene
 from cpn_sim_worker.render import Renderer
 from cpn_sim_worker.scene import Scene, Transition
-from cpn_sim_worker.tasks import TASKS, check_task
+from cpn_sim_worker.tasks import METAWORLD_TASKS, check_task
 
 
 def scene_type(task: str) -> type[MetaWorldScene | JengaScene]:
@@ -17,7 +17,7 @@ def scene_type(task: str) -> type[MetaWorldScene | JengaScene]:
         UnknownTaskError: If the task is unknown.
     """
     check_task(task)
-    return MetaWorldScene if task in TASKS else JengaScene
+    return MetaWorldScene if task in METAWORLD_TASKS else JengaScene
 
 
 class Simulator:

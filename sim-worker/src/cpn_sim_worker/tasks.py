@@ -29,6 +29,38 @@ TASKS = (
     "window-open",
 )
 
+FURTHER_TASKS = (
+    "bin-picking",
+    "box-close",
+    "button-press-topdown-wall",
+    "button-press-wall",
+    "coffee-push",
+    "hammer",
+    "hand-insert",
+    "handle-press-side",
+    "handle-pull-side",
+    "peg-unplug-side",
+    "pick-out-of-hole",
+    "pick-place",
+    "pick-place-wall",
+    "plate-slide-back",
+    "plate-slide-back-side",
+    "plate-slide-side",
+    "push",
+    "push-back",
+    "push-wall",
+    "reach-wall",
+    "shelf-place",
+    "soccer",
+    "stick-pull",
+    "stick-push",
+    "sweep",
+    "sweep-into",
+)
+"""The other 26 tasks of Meta-World, of which demonstrations are recorded only where they are named."""
+
+METAWORLD_TASKS = TASKS + FURTHER_TASKS
+
 JENGA_TASKS = ("jenga-poke", "jenga-poke-offset")
 
 EPISODE_STEPS = 150
@@ -60,11 +92,11 @@ class UnknownTaskError(ValueError):
     """Unknown task."""
 
     def __init__(self, task: str) -> None:
-        self.expected = f"one of {', '.join(TASKS + JENGA_TASKS)}"
+        self.expected = f"one of {', '.join(METAWORLD_TASKS + JENGA_TASKS)}"
         super().__init__(f"unknown task {task!r}; expected {self.expected}")
 
 
 def check_task(task: str) -> None:
-    """Raises `UnknownTaskError` unless `task` is one of `TASKS` or `JENGA_TASKS`."""
-    if task not in TASKS + JENGA_TASKS:
+    """Raises `UnknownTaskError` unless `task` is one of `METAWORLD_TASKS` or `JENGA_TASKS`."""
+    if task not in METAWORLD_TASKS + JENGA_TASKS:
         raise UnknownTaskError(task)

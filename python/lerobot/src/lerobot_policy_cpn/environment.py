@@ -12,7 +12,7 @@ from lerobot_policy_cpn.environment_configuration import CAMERA, GOAL
 try:
     from cpn_sim_worker.expert import ExpertFailedError
     from cpn_sim_worker.gym import SceneEnv
-    from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, TASKS
+    from cpn_sim_worker.tasks import FIRST_EVALUATION_SEED, METAWORLD_TASKS
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(f"env.type=cpn: expected cpn-sim-worker to be installed, got {error}") from error
 
@@ -43,8 +43,8 @@ class GoalImageEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: If there is no such Meta-World task.
         """
-        if task not in TASKS:
-            raise ValueError(f"env.task: expected one of {', '.join(TASKS)}, got {task!r}")
+        if task not in METAWORLD_TASKS:
+            raise ValueError(f"env.task: expected one of {', '.join(METAWORLD_TASKS)}, got {task!r}")
         # LeRobot 0.6 reads both names.
         self.task = self.task_description = task
         self._scene = SceneEnv(task, goal_image=True, render_mode=render_mode)
