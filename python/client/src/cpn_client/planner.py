@@ -59,8 +59,8 @@ class Planner:
             model: Name of the model.
             goal: Registered goal, image of the finished task, or target position, x, y, z in metres.
             observation: Camera image, or position of the hand, x, y, z in metres.
-            seed: Seed of everything random: the same request and seed get the same plan from the same checkpoint, unless
-                the search is anytime.
+            seed: Seed of everything random: the same request and seed get the same plan from the same checkpoint,
+                unless the search is anytime.
             deadline_ms: Longest wait for the plan, in milliseconds; the connection's timeout if None.
             search: Search for the actions; the model's own if None.
             warm_start: [horizon, A], initial plan of the search: `Plan.warm_start` of the step before.
