@@ -7,7 +7,7 @@ import yaml
 from cells import ROOT
 
 HERE = ROOT / "experiments/leave_one_out"
-TRAINED = {"bc", "te-bc", "te-bc-horizon", "upn", "cpn"}
+TRAINED = {"bc", "te-bc", "te-bc-horizon", "upn", "cpn", "cpn-position"}
 
 
 def dry_run(folder: Path, profile: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -22,7 +22,7 @@ def counted(done: subprocess.CompletedProcess[str]) -> dict[str, int]:
     return {line[0]: int(line[1]) for line in lines if len(line) == 2 and line[1].isdecimal()}
 
 
-@pytest.mark.parametrize(("profile", "training", "evaluation"), [("desk", 120, 384), ("paper", 360, 1008)])
+@pytest.mark.parametrize(("profile", "training", "evaluation"), [("desk", 144, 408), ("paper", 360, 1008)])
 def test_a_profile_has_the_jobs_of_its_folds_methods_and_seeds(
     tmp_path: Path, profile: str, training: int, evaluation: int
 ) -> None:
