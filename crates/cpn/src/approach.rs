@@ -3,20 +3,25 @@
 /// Standard deviations within which the hand is at its target, and beyond which it has moved.
 const RADIUS: f32 = 0.1;
 /// Distance between the goal's position and a target beside it, in standard deviations.
-const OFFSET: f32 = 1.0;
+const OFFSET: f32 = 2.0;
+/// Height above a target beside the goal at which the hand comes to it, over what stands between, in standard deviations.
+const RISE: f32 = 1.0;
 /// Number of plans without motion after which the hand has stalled.
 const PATIENCE: u32 = 8;
 /// The same under the policy's plans, which rest to grasp.
 const POLICY_PATIENCE: u32 = 24;
 /// Largest absolute value of a position that is kept, in standard deviations.
 const MAX_POSITION: f32 = 1000.0;
-/// Sides of the goal to come from, in turn: left, below, above, right, front and back in Meta-World.
+/// Sides of the goal to come from, in turn, x towards the middle of the training positions: inside, outside, below, above, front and
+/// back in Meta-World.
 const SIDES: [[f32; 3]; 6] =
-    [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]];
+    [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]];
+/// Number of targets of a side: above it, beside the goal, and the goal again.
+const TARGETS: u32 = 3;
 
 /// Progress of an episode's hand through its targets, of a model with position dynamics. The targets are, for a familiar goal, first the
-/// ends of the policy's plans; then the goal's position, and by turns a position beside it and the goal's again. The next target begins
-/// when the hand is at the last or has stalled: the progress check of navigation (Nav2).
+/// ends of the policy's plans; then the goal's position, and for each side of it in turn one above, one beside and the goal's again. The
+/// next target begins when the hand is at the last or has stalled: the progress check of navigation (Nav2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Approach {
     /// Number of targets that were reached or given up.
@@ -34,7 +39,7 @@ enum Target {
     Policy,
     /// The goal's position.
     Goal,
-    /// The goal's position, moved by so many standard deviations.
+    /// The goal's position, moved by so many standard deviations, x towards the middle of the training positions.
     Beside([f32; 3]),
 }
 
@@ -82,9 +87,11 @@ impl Approach {
             (true, tried) => tried - 1,
             (false, tried) => tried,
         };
-        match tried % 2 {
+        let side = SIDES[(tried / TARGETS) as usize % SIDES.len()].map(|direction| OFFSET * direction);
+        match tried % TARGETS {
             0 => Target::Goal,
-            _ => Target::Beside(SIDES[tried as usize / 2 % SIDES.len()]),
+            1 => Target::Beside([side[0], side[1], side[2] + RISE]),
+            _ => Target::Beside(side),
         }
     }
 }
@@ -96,7 +103,7 @@ impl Target {
         match self {
             Self::Policy => None,
             Self::Goal => Some(goal),
-            Self::Beside(side) => Some(std::array::from_fn(|axis| goal[axis] + OFFSET * side[axis])),
+            Self::Beside([x, y, z]) => Some([goal[0] - goal[0].signum() * x, goal[1] + y, goal[2] + z]),
         }
     }
 }
@@ -126,13 +133,17 @@ mod tests {
         let far = [0.0; 4];
         let mut approach = Approach::first(&far);
         let mut targets = Vec::new();
-        for _ in 0..4 {
+        for _ in 0..6 {
             targets.push(approach.towards(&GOAL, false));
             assert_eq!(rest(approach, far, false, PATIENCE - 1).tried, approach.tried);
             approach = rest(approach, far, false, PATIENCE);
         }
-        assert_eq!(targets, [GOAL, [0.0, 2.0, 3.0, 7.0], GOAL, [1.0, 2.0, 2.0, 7.0]]);
-        let round = 2 * SIDES.len() as u32;
+        let inside = [[-1.0, 2.0, 4.0, 7.0], [-1.0, 2.0, 3.0, 7.0]];
+        let outside = [[3.0, 2.0, 4.0, 7.0], [3.0, 2.0, 3.0, 7.0]];
+        assert_eq!(targets, [GOAL, inside[0], inside[1], GOAL, outside[0], outside[1]]);
+        let mirrored = Approach { tried: 2, ..approach }.towards(&[-1.0, 2.0, 3.0, 7.0], false);
+        assert_eq!(mirrored, [1.0, 2.0, 3.0, 7.0]);
+        let round = TARGETS * SIDES.len() as u32;
         let again = Approach { tried: round + 1, ..approach };
         assert_eq!(again.towards(&GOAL, false), targets[1]);
         assert_eq!(rest(Approach { tried: u32::MAX, ..approach }, far, true, PATIENCE).tried, u32::MAX);

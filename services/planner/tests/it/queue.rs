@@ -1,6 +1,7 @@
 //! Model thread under load and faults, with a method that waits for the test.
 
-use crate::common::{self, Client, Fixture, Gate, faulty, image, is, method, plan_request, random, soon};
+use crate::common::{self, Client, Fixture, Gate, faulty, image, is, method, plan_request, random, soon, timeless};
+use cpn::{MethodKind, Model, ModelConfig};
 use futures::future::join_all;
 use planner::core::PlannerCore;
 use planner::model::RANDOM;
@@ -8,6 +9,7 @@ use std::future::Future;
 use std::pin::Pin;
 use std::sync::mpsc;
 use std::time::Duration;
+use testing::{provenance, small_config};
 use wire::planner::{PlanRequest, PlanResponse};
 use wire::{Code, Error, proto};
 
@@ -172,6 +174,26 @@ async fn queued_requests_are_planned_in_batches() {
     for (request, answer) in requests.into_iter().zip(together) {
         let alone = client.plan(proto::PlanRequest { model: RANDOM.into(), ..request }).await.unwrap();
         assert_eq!(alone.actions, answer.actions, "each gets its own plan");
+    }
+}
+
+/// Requests with different approaches, and one without, share a batch.
+#[tokio::test(flavor = "multi_thread")]
+async fn each_request_of_a_batch_has_its_approach() {
+    let config = ModelConfig { position_dynamics: true, ..small_config(MethodKind::Cpn) };
+    let moving = cpn::checkpoint::to_bytes(&Model::new(config, 1), &provenance(&["reach"], 1)).unwrap();
+    let fixture = Fixture::start(&[("moving", moving)], |_| ()).await;
+    let at = |tried| Some(proto::Approach { tried, position: vec![0.0; 3], plans: 0 });
+    let requests = [None, at(0), at(1), at(2), at(4), None]
+        .map(|approach| proto::PlanRequest { approach, ..plan_request("moving", 3) });
+    let (_, together) = planned_together(&fixture, requests.to_vec()).await;
+    let [client, ..] = fixture.clients();
+    for (request, answer) in requests.into_iter().zip(&together) {
+        assert_eq!(timeless(client.plan(request).await.unwrap()), timeless(answer.clone()));
+    }
+    assert_eq!(together[0].actions, together[1].actions, "both towards the goal's position");
+    for others in together[1..5].windows(2) {
+        assert_ne!(others[0].actions, others[1].actions);
     }
 }
 

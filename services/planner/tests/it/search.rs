@@ -110,7 +110,7 @@ async fn an_approach_moves_the_target_when_the_hand_stalls() {
         let at = |tried| Some(proto::Approach { tried, ..last.approach.unwrap().into() });
         let plan = async |approach| client.plan(proto::PlanRequest { approach, ..request.clone() }).await.unwrap();
         assert_eq!(plan(at(1)).await.actions, last.actions);
-        assert_eq!(plan(at(2)).await.actions, first.actions, "the goal's position again");
+        assert_eq!(plan(at(3)).await.actions, first.actions, "the goal's position again");
 
         let named = proto::PlanRequest { search: search(Solver::Gradient, None, false), ..request };
         assert_eq!(timeless(client.plan(named).await.unwrap()), PlanResponse { approach: None, ..first });
