@@ -25,7 +25,7 @@ PYTHON := . $(addprefix ../,examples experiments python tests)
 export CPN_SIM_WORKER := $(CURDIR)/$(WORKER)/bin/cpn-sim-worker
 
 .DEFAULT_GOAL := help
-.PHONY: help bases stack setup system build demo dataset jenga ablations experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-triton test-kubernetes test-stack test-bench test-experiment test-shipped fuzz test-fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
+.PHONY: help bases stack setup system build demo dataset jenga ablations further-tasks experiment experiment-report models sign-models export-lerobot import-lerobot view test test-crash test-swap test-soak test-export test-client test-adapters test-view test-openpi test-triton test-kubernetes test-stack test-bench test-experiment test-shipped fuzz test-fuzz bench-sim bench-train bench-plan bench-stack deny dist lint format clean
 
 help: ## Show the verbs
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -115,8 +115,11 @@ experiment-report: $(EXPERIMENT)/.ready ## Make the committed reports of the exp
 		$(EXPERIMENT)/bin/python experiments/leave_one_out/report.py $$results || exit 1; \
 	done
 
-ablations: build ## Train with other losses and dynamics, two seeds each, and evaluate on six tasks left out of training (GROUPS="reported-1 reported-2 reported-3" for the others); goes on where it was interrupted
+ablations: build ## Train by the paper's methods and with other losses and dynamics, two seeds each, and evaluate on six tasks left out of training (GROUPS="reported-1 reported-2 reported-3" for the others); goes on where it was interrupted
 	$(WORKER)/bin/python experiments/ablations.py $(if $(GROUPS),--groups $(GROUPS))
+
+further-tasks: build ## Evaluate the shipped checkpoints on the 26 tasks of Meta-World without demonstrations; goes on where it was interrupted
+	$(WORKER)/bin/python experiments/further_tasks.py
 
 models: build ## Make the shipped checkpoints again: demonstrations, then training
 	$(WORKER)/bin/python experiments/models.py

@@ -7,17 +7,16 @@ goes on. Each run's outcomes are kept in docs/results/ablations, of which --tabl
 import argparse
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from dataset import DATASET, record
 from lab import ROOT, Lab, main, train
-from scipy.stats import binomtest, bootstrap
+from outcome_tables import Columns, count, differences, task_table
 
 RESULTS = ROOT / "docs/results/ablations"
 DEVELOPMENT = ("coffee-button", "dial-turn", "door-lock", "drawer-close", "handle-press", "handle-pull")
@@ -49,8 +48,8 @@ DEFAULT = "default"
 """Number of updates that the planner chooses, straight towards the goal."""
 APPROACHES = "approaches"
 """The same, with approaches: no option."""
-CONTROLS = ("no-op", "oracle")
-"""Controls of the evaluator."""
+CONTROLS = ("random", "no-op", "oracle")
+"""Controls of the evaluator, and the planner's random actions."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,8 @@ class Arm:
     method: str = "cpn"
     noise: float = 0
     """Noise injection of the demonstrations."""
+    evaluation: tuple[str, ...] = ()
+    """Further options of the evaluation."""
     updates: tuple[int | str, ...] = (0, 1, 5)
     """Numbers of updates to plan with, of a method that plans; `DEFAULT` and `APPROACHES` for the planner's choice."""
 
@@ -72,13 +73,13 @@ class Arm:
 
     @property
     def is_trained(self) -> bool:
-        """False for a control of the evaluator."""
+        """False for a control."""
         return self.method not in CONTROLS
 
     @property
     def plans(self) -> bool:
         """Whether the method plans, with a number of updates."""
-        return self.method == "cpn"
+        return self.method in {"upn", "cpn"}
 
 
 ARMS = {
@@ -86,7 +87,11 @@ ARMS = {
     "every-update": Arm(EVERY_UPDATE),
     "every-update-dynamics": Arm(EVERY_UPDATE | DYNAMICS),
     "every-update-dynamics-position": Arm(EVERY_UPDATE | DYNAMICS | POSITION),
+    "bc": Arm(method="bc"),
     "te-bc": Arm(method="te-bc"),
+    # The steps left are counted down from about the mean length of a demonstration over all tasks.
+    "te-bc-horizon": Arm(method="te-bc-horizon", evaluation=("--task-steps", "70")),
+    "upn": Arm(method="upn", updates=(1,)),
     "position-te-bc": Arm(POSITION, "te-bc"),
     "position-dynamics": Arm(POSITION_DYNAMICS, updates=(0, 1, 2, 5, 20)),
     "accurate-position-dynamics": Arm(POSITION_DYNAMICS | ACCURATE, updates=(0, 1, 2, 5, 20)),
@@ -98,10 +103,14 @@ ARMS = {
     "noise-every-update-dynamics": Arm(NOISY_EPOCHS | EVERY_UPDATE | DYNAMICS, noise=NOISE),
 } | {control: Arm(method=control) for control in CONTROLS}
 REPORTED_ARMS = {
+    "random": (0,),
     "no-op": (0,),
     "oracle": (0,),
+    "bc": (0,),
     "te-bc": (0,),
+    "te-bc-horizon": (0,),
     "position-te-bc": (0,),
+    "upn": (1,),
     "paper": (1,),
     "position-dynamics": (0, 5),
     "accurate-position-dynamics": (0, 5),
@@ -109,10 +118,22 @@ REPORTED_ARMS = {
 }
 """Arms that are run on the reported tasks, with their numbers of updates."""
 BEST = ("accurate-position-dynamics", "5")
-"""Arm and number of updates that the others are compared with."""
+"""Arm and number of updates that the others are compared with on the reported tasks."""
+METHODS = {
+    "random": (0,),
+    "no-op": (0,),
+    "oracle": (0,),
+    "bc": (0,),
+    "te-bc": (0,),
+    "te-bc-horizon": (0,),
+    "upn": (1,),
+    "paper": (1,),
+    "familiar-goals": (APPROACHES,),
+}
+"""Methods of the table of all tasks: controls, the paper's, and what is shipped."""
+SHIPPED = ("familiar-goals", APPROACHES)
 SEEDS = (0, 1)
 TRIALS = 20
-BOOTSTRAP: dict[str, Any] = {"method": "percentile", "n_resamples": 10_000, "rng": 0}
 
 Outcomes = dict[str, dict[str, list[int]]]
 """1 for a success, 0 for a failure, of each variation in the order of seeds, by number of updates and task."""
@@ -165,7 +186,9 @@ def run(cell: Cell) -> None:
         lab.worker("w0")
         search = ["--models", recipe.method, "--tasks", ",".join(cell.tasks), "--trials", str(TRIALS)]
         for updates in cell.updates:
-            lab.evaluate(*search, *_planning(recipe, updates), "--out", str(out / f"updates-{updates}"))
+            lab.evaluate(
+                *search, *recipe.evaluation, *_planning(recipe, updates), "--out", str(out / f"updates-{updates}")
+            )
     keep(cell, out)
 
 
@@ -197,79 +220,43 @@ def development_table() -> str:
     lines.append("|---" * (5 + len(DEVELOPMENT)) + "|")
     for arm, seed in product(ARMS, SEEDS):
         for updates, by_task in Cell("development", arm, seed).outcomes().items():
-            total = ["/".join(map(str, _count(by_task, tasks))) for tasks in (DEVELOPMENT, TRAINED)]
+            total = ["/".join(map(str, count(by_task, tasks))) for tasks in (DEVELOPMENT, TRAINED)]
             each = [str(sum(by_task[task])) for task in DEVELOPMENT]
             lines.append(f"| {arm} | {seed} | {updates} | " + " | ".join(total + each) + " |")
     return "\n".join(lines)
 
 
-def reported_table() -> str:
-    """Successes on the reported tasks by arm and number of updates, with Wilson intervals, in Markdown.
-
-    Groups and training seeds are pooled, so that the intervals leave out the differences between seeds; cells that were
-    not run are missing.
-    """
-    arms = _reported(SEEDS)
-    tasks = [task for group in REPORTED.values() for task in group]
-    names = [_name(*column) for column in arms]
-    lines = ["| task | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
-    for task in tasks:
-        counts = [_count(row, (task,)) if task in row else None for row in arms.values()]
-        lines.append(f"| {task} | " + " | ".join("/".join(map(str, count)) if count else "" for count in counts) + " |")
-    totals = [_count(row, tuple(row)) for row in arms.values()]
-    lines.append("| all | " + " | ".join(f"{solved}/{trials}" for solved, trials in totals) + " |")
-    intervals = [binomtest(*total).proportion_ci(method="wilson") for total in totals]
-    percent = [f"{100 * interval.low:.0f} to {100 * interval.high:.0f}" for interval in intervals]
-    lines.append("| 95 %, in per cent | " + " | ".join(percent) + " |")
-    return "\n".join(lines)
+def columns(arms: Mapping[str, Iterable[int | str]], groups: Iterable[str], seeds: Iterable[int]) -> Columns:
+    """Outcomes on the held-out tasks of groups, by arm and number of updates, and by task."""
+    found = Columns()
+    for (arm, all_updates), group, seed in product(arms.items(), groups, seeds):
+        outcomes = Cell(group, arm, seed).outcomes()
+        for updates in map(str, all_updates):
+            for task in GROUPS[group] if updates in outcomes else ():
+                row = found.setdefault(heading(arm, updates), {})
+                row.setdefault(task, []).extend(outcomes[updates][task])
+    return found
 
 
-def differences() -> str:
-    """Paired differences of the success rate on the reported tasks between `BEST` and the other columns, in Markdown.
-
-    They are of the first training seed. Pairs are of the same variation; the intervals are bootstrapped over tasks.
-    Columns of other tasks, as long as not all groups were run, are left out.
-    """
-    columns = _reported(SEEDS[:1])
-    best = columns.pop(BEST, None)
-    lines = [
-        f"| {_name(*BEST)} against | difference | 95 %, over tasks | it alone | the other alone |",
-        "|---" * 5 + "|",
-    ]
-    for column, other in columns.items():
-        if best is None or best.keys() != other.keys():
-            continue
-        pairs = [np.array([best[task], other[task]]) for task in best]
-        by_task = np.array([np.mean(mine - others) for mine, others in pairs])
-        interval = bootstrap((by_task,), np.mean, **BOOTSTRAP).confidence_interval
-        alone = [sum(int(np.sum(pair[i] > pair[1 - i])) for pair in pairs) for i in (0, 1)]
-        percent = [f"{100 * value:+.0f} %" for value in (by_task.mean(), interval.low, interval.high)]
-        lines.append(f"| {_name(*column)} | {percent[0]} | {percent[1]} to {percent[2]} | {alone[0]} | {alone[1]} |")
-    return "\n".join(lines)
-
-
-def _reported(seeds: Iterable[int]) -> dict[tuple[str, str], dict[str, list[int]]]:
-    """Outcomes on the reported tasks by arm and number of updates, and by task."""
-    columns: dict[tuple[str, str], dict[str, list[int]]] = {}
-    for arm, group, seed in product(REPORTED_ARMS, REPORTED, seeds):
-        for updates, by_task in Cell(group, arm, seed).outcomes().items():
-            row = columns.setdefault((arm, updates), {})
-            for task, outcomes in by_task.items():
-                row.setdefault(task, []).extend(outcomes)
-    return columns
-
-
-def _name(arm: str, updates: str) -> str:
+def heading(arm: str, updates: str) -> str:
     """Heading of a column."""
     if not ARMS[arm].plans:
         return arm
     return f"{arm}, U = {updates}" if updates.isdigit() else f"{arm}, {updates}"
 
 
-def _count(by_task: dict[str, list[int]], tasks: tuple[str, ...]) -> tuple[int, int]:
-    """Successes and trials."""
-    outcomes = [outcome for task in tasks for outcome in by_task[task]]
-    return sum(outcomes), len(outcomes)
+def tables() -> list[str]:
+    """Tables of the kept outcomes, in Markdown, as in docs/results/README.md."""
+    reported = columns(REPORTED_ARMS, REPORTED, SEEDS)
+    first_seed = columns(REPORTED_ARMS, REPORTED, SEEDS[:1])
+    methods = columns(METHODS, GROUPS, SEEDS[:1])
+    return [
+        development_table(),
+        task_table(reported),
+        differences(heading(*BEST), first_seed),
+        task_table(methods),
+        differences(heading(*SHIPPED), methods),
+    ]
 
 
 def ablations() -> None:
@@ -301,7 +288,7 @@ def ablations() -> None:
         with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             for _ in pool.map(run, cells):
                 pass
-    print(development_table(), reported_table(), differences(), sep="\n\n")
+    print(*tables(), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,11 @@
 //! Approach of an episode: progress of the hand through targets, the next one where it stalls.
 
-/// Standard deviations within which the hand is at its target, and beyond which it has moved.
-const RADIUS: f32 = 0.1;
+/// Distance beyond which the hand has moved, in standard deviations.
+const MOTION: f32 = 0.1;
+/// Distance within which the hand is at the goal's position, in standard deviations.
+const GOAL_RADIUS: f32 = 0.15;
+/// The same of a target beside the goal, which the hand only passes.
+const PASSING_RADIUS: f32 = 0.7;
 /// Distance between the goal's position and a target beside it, in standard deviations.
 const OFFSET: f32 = 2.0;
 /// Height above a target beside the goal at which the hand comes to it, over what stands between, in standard deviations.
@@ -54,8 +58,9 @@ impl Approach {
         let hand = position(x);
         let target = self.target(is_familiar);
         let patience = if target == Target::Policy { POLICY_PATIENCE } else { PATIENCE };
-        let has_arrived = target.position(x_g).is_some_and(|target| distance(hand, target) <= RADIUS);
-        let has_moved = distance(hand, self.position) > RADIUS;
+        let radius = if target == Target::Goal { GOAL_RADIUS } else { PASSING_RADIUS };
+        let has_arrived = target.position(x_g).is_some_and(|target| distance(hand, target) <= radius);
+        let has_moved = distance(hand, self.position) > MOTION;
         let plans = self.plans.saturating_add(1);
 
         if has_arrived || (!has_moved && plans >= patience) {
@@ -158,8 +163,10 @@ mod tests {
             approach = approach.next(&[0.0, 0.0, 0.03 * step as f32, 0.0], &[9.0; 4], false);
         }
         assert_eq!(approach.tried, 0);
-        let near = [1.0, 2.0, 2.95, 0.0];
-        assert_eq!(approach.next(&near, &GOAL, false), Approach { tried: 1, position: [1.0, 2.0, 2.95], plans: 0 });
+        let near = [1.0, 2.0, 2.87, 0.0];
+        let raised = approach.next(&near, &GOAL, false);
+        assert_eq!(raised, Approach { tried: 1, position: [1.0, 2.0, 2.87], plans: 0 });
+        assert_eq!(raised.next(&[-1.0, 2.0, 3.4, 0.0], &GOAL, false).tried, 2, "it passes a target beside the goal");
     }
 
     #[test]
