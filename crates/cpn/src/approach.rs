@@ -8,7 +8,7 @@ const GOAL_RADIUS: f32 = 0.15;
 const PASSING_RADIUS: f32 = 0.7;
 /// Distance between the goal's position and a target beside it, in standard deviations.
 const OFFSET: f32 = 2.0;
-/// Height above a target beside the goal at which the hand comes to it, over what stands between, in standard deviations.
+/// Height above a target beside the goal of the target before it, over what stands between, in standard deviations.
 const RISE: f32 = 1.0;
 /// Number of plans without motion after which the hand has stalled.
 const PATIENCE: u32 = 8;
@@ -163,9 +163,11 @@ mod tests {
             approach = approach.next(&[0.0, 0.0, 0.03 * step as f32, 0.0], &[9.0; 4], false);
         }
         assert_eq!(approach.tried, 0);
-        let near = [1.0, 2.0, 2.87, 0.0];
+        let (far, near) = ([1.0, 2.0, 2.8, 0.0], [1.0, 2.0, 2.87, 0.0]);
+        assert_eq!(approach.next(&far, &GOAL, false).tried, 0);
         let raised = approach.next(&near, &GOAL, false);
         assert_eq!(raised, Approach { tried: 1, position: [1.0, 2.0, 2.87], plans: 0 });
+        assert_eq!(raised.next(&[-1.0, 2.0, 3.2, 0.0], &GOAL, false).tried, 1);
         assert_eq!(raised.next(&[-1.0, 2.0, 3.4, 0.0], &GOAL, false).tried, 2, "it passes a target beside the goal");
     }
 

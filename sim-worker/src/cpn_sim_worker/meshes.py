@@ -30,7 +30,7 @@ class Decimation:
 
     max_faces: int = 1000
     """Maximum number of faces of a mesh, unless the decimation ends above it. `make bench-sim` requires a mean SSIM of
-    0.97 to the undecimated images, for each task."""
+    0.97 to the undecimated images, for each of the 24 tasks."""
     min_aggressiveness: int = 3
     """First aggressiveness of the quadric decimation: lower values distribute faces better, higher ones reach fewer."""
     max_aggressiveness: int = 10

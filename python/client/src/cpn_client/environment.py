@@ -22,7 +22,7 @@ def connect_from_environment(address: str = "") -> Planner:
         address: Address in place of that in `CPN_CONNECT`.
 
     Raises:
-        ValueError: If a variable does not go with another, or a file cannot be read; it names the variable.
+        ValueError: If a variable does not go with another or with the address, or a file cannot be read.
     """
     tls = [variable(f"CPN_TLS_{name}") for name in ("CA", "CERTIFICATE", "PRIVATE_KEY")]
     return connect(

@@ -36,7 +36,8 @@ class PlannerModelServer(PredictModelServer):
 
         Args:
             address: Zenoh endpoint of the planner or of a router, or `grpc://HOST:PORT` or `grpcs://HOST:PORT`; by
-                default and beyond that, `cpn_client.connect_from_environment`.
+                default `CPN_CONNECT`. Name, namespace, certificates and token come from the environment, see
+                `cpn_client.connect_from_environment`.
             model: Name of the planner's model.
             goal: Image file of the finished task, for tasks without one in `goals`.
             goals: Image files of the finished task, by the task's description.
