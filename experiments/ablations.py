@@ -1,4 +1,4 @@
-"""The paper's methods, and ablations of losses, dynamics and noise injection, on tasks left out of training six at once.
+"""The paper's methods, and ablations of losses, dynamics and noise injection, on tasks left out of training by sixes.
 
 Recipes are chosen by the development tasks; the arms in `REPORTED_ARMS` are then run on the 18 others. Interrupted, it
 goes on. Each run's outcomes are kept in docs/results/ablations, of which --table makes the tables.
