@@ -60,6 +60,17 @@ def decimate() -> dict[str, NDArray[Any]]:
     return {name: getattr(light, name).copy() for name in MESH_ARRAYS}
 
 
+def test_a_mesh_that_stays_above_the_limit_has_the_fewest_faces(monkeypatch: pytest.MonkeyPatch) -> None:
+    faces = {3: 800, 4: 600}
+    simplify = meshes.fast_simplification.simplify
+
+    def coarse(*args: Any, target_count: int, agg: int) -> Any:  # noqa: ANN401
+        return simplify(*args, target_count=faces.get(agg, 700), agg=agg)
+
+    monkeypatch.setattr(meshes.fast_simplification, "simplify", coarse)
+    assert 500 < decimate()["mesh_facenum"].max() <= 600
+
+
 def assert_decimated_anew(caplog: pytest.LogCaptureFixture, *warnings: str) -> None:
     """Asserts that the meshes are correct, and that the log names each file and fault once."""
     caplog.clear()
