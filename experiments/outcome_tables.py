@@ -20,7 +20,7 @@ def task_table(columns: Columns) -> str:
     lines = ["| task | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in sorted({task for row in columns.values() for task in row}):
         counts = [count(row, (task,)) if task in row else None for row in columns.values()]
-        lines.append(f"| {task} | " + " | ".join("/".join(map(str, count)) if count else "" for count in counts) + " |")
+        lines.append(f"| {task} | " + " | ".join("/".join(map(str, cell)) if cell else "" for cell in counts) + " |")
     totals = [count(row, tuple(row)) for row in columns.values()]
     lines.append("| all | " + " | ".join(f"{solved}/{trials}" for solved, trials in totals) + " |")
     intervals = [binomtest(*total).proportion_ci(method="wilson") for total in totals]

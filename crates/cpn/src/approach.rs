@@ -4,7 +4,7 @@
 const MOTION: f32 = 0.1;
 /// Distance within which the hand is at the goal's position, in standard deviations.
 const GOAL_RADIUS: f32 = 0.15;
-/// The same of a target beside the goal, which the hand only passes.
+/// Distance within which the hand has passed a target beside the goal, in standard deviations.
 const PASSING_RADIUS: f32 = 0.7;
 /// Distance between the goal's position and a target beside it, in standard deviations.
 const OFFSET: f32 = 2.0;

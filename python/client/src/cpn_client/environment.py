@@ -43,7 +43,7 @@ def tls_of(ca: str, certificate: str, private_key: str, *, field: str) -> Tls | 
     """Files of TLS, none of which is required; `field` names that of the authority in errors.
 
     Raises:
-        ValueError: If there is a certificate or key without an authority or each other.
+        ValueError: If there is a certificate or key without an authority.
     """
     if ca:
         return Tls(ca, certificate or None, private_key or None)
